@@ -1,0 +1,158 @@
+"""A motion over time, and the kinematics that everything else reads."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation, Slerp
+
+from motionfit import rotation
+from motionfit._skeleton import Skeleton
+from motionfit._types import AnyArray, InputError, Positions, Rotations
+
+
+class Motion(eqx.Module):
+    """A clip: where the root is and how each joint is turned, frame by frame, on the skeleton it was made for.
+
+    `root` [m] is the root joint's position in the world; `rotations` are joint-to-parent unit quaternions wxyz;
+    `dt` [s] the time between frames. `translations` [m] are joint-to-parent positions for the rare file that
+    animates them (None: the skeleton's offsets hold).
+    """
+
+    skeleton: Skeleton
+    root: Float[AnyArray, "frames 3"]
+    rotations: Rotations
+    dt: Float[AnyArray, ""] = eqx.field(converter=lambda x: np.asarray(x, float) if isinstance(x, float | int) else x)
+    translations: Positions | None = None
+
+    def __check_init__(self):
+        joints = len(self.skeleton.names)
+        root, rotations = getattr(self.root, "shape", None), getattr(self.rotations, "shape", None)
+        if root is not None and rotations is not None and rotations[-3:] != (*root[-2:-1], joints, 4):
+            raise InputError(f"a motion of {joints} joints needs root (frames, 3) and rotations (frames, {joints}, 4); "
+                             f"got {root} and {rotations}")  # fmt: skip
+
+    @property
+    def frame_count(self) -> int:
+        return self.root.shape[0]
+
+    @property
+    def frame_rate(self) -> float:
+        """[1/s]"""
+        return 1.0 / float(self.dt)
+
+    def __getitem__(self, frames: slice | np.ndarray) -> "Motion":
+        """The motion of some frames, at the same dt."""
+        translations = None if self.translations is None else self.translations[frames]
+        return Motion(self.skeleton, self.root[frames], self.rotations[frames], self.dt, translations)
+
+
+def rest_motion(skeleton: Skeleton, dt: float = 1 / 60) -> Motion:
+    """One frame in the bind pose."""
+    return Motion(skeleton, skeleton.offsets[:1], skeleton.rest_rotations[None], dt)
+
+
+def resample(motion: Motion, frame_rate: float) -> Motion:
+    """The clip at another frame rate [1/s]: positions linearly, rotations along the shortest arc (SciPy Slerp)."""
+    if frame_rate <= 0:
+        raise InputError(f"a frame rate must be above 0, got {frame_rate}")
+    times = np.arange(motion.frame_count) * float(motion.dt)
+    # the small allowance keeps the last frame when the duration is a whole number of new frames
+    new = np.arange(int(times[-1] * frame_rate + 1e-6) + 1) / frame_rate
+    if motion.frame_count == 1 or (len(new) == len(times) and np.allclose(new, times, atol=1e-9)):
+        return motion
+    new = np.minimum(new, times[-1])
+    rotations = np.asarray(motion.rotations)
+    turned = np.stack(
+        [
+            Slerp(times, Rotation.from_quat(rotations[:, j], scalar_first=True))(new).as_quat(scalar_first=True)
+            for j in range(rotations.shape[1])
+        ],
+        axis=1,
+    )
+
+    def linear(x):
+        x = np.asarray(x)
+        columns = [np.interp(new, times, c) for c in x.reshape(len(times), -1).T]
+        return np.stack(columns, axis=1).reshape(len(new), *x.shape[1:])
+
+    translations = None if motion.translations is None else linear(motion.translations)
+    return Motion(motion.skeleton, linear(motion.root), turned, 1.0 / frame_rate, translations)
+
+
+class Kinematics(eqx.Module):
+    """What forward kinematics returns. Computed once per evaluation; every term reads it.
+
+    `positions_world` [m] and `rotations_world` of all joints, the `rotations_parent` they came from, `dt` [s],
+    and `signals`, the values of the problem's controls in each frame [rad] (none without a correction).
+    """
+
+    positions_world: Positions
+    rotations_world: Rotations
+    rotations_parent: Rotations
+    dt: Float[AnyArray, ""]
+    signals: Float[AnyArray, "frames controls"]
+
+
+def forward_kinematics(
+    skeleton: Skeleton, motion: Motion, signals: Float[AnyArray, "frames controls"] | None = None
+) -> Kinematics:
+    """World position and rotation of every joint in every frame.
+
+    Level by level over the static tree: all joints of one depth are turned at once, each quaternion component
+    being a (joints of the level, frames) array. For 31 joints this is some fifty times faster on the CPU than
+    one joint after the other, since the work is in long contiguous vectors, and the program that XLA sees
+    grows with the depth of the tree instead of its size.
+    """
+    local = jnp.moveaxis(jnp.asarray(motion.rotations), 0, -1)  # (joints, 4, frames)
+    offsets = jnp.asarray(skeleton.offsets)
+    levels = skeleton.levels
+    # components of the level above: rotation 4 x (level, frames), position 3 x (level, frames)
+    q = tuple(local[:1, i] for i in range(4))
+    p = tuple(jnp.asarray(motion.root)[:, i][None] for i in range(3))
+    all_q, all_p = [jnp.stack(q, -1)], [jnp.stack(p, -1)]
+    for above, level in zip(levels, levels[1:], strict=False):
+        parent = np.array([above.index(skeleton.parents[j]) for j in level])
+        joints = np.array(level)
+        aw, ax, ay, az = (c[parent] for c in q)
+        px, py, pz = (c[parent] for c in p)
+        if motion.translations is None:
+            vx, vy, vz = (offsets[joints, i][:, None] for i in range(3))
+        else:
+            vx, vy, vz = (jnp.asarray(motion.translations)[:, joints, i].T for i in range(3))
+        bw, bx, by, bz = (local[joints, i] for i in range(4))
+        q = (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        )
+        tx, ty, tz = 2 * (ay * vz - az * vy), 2 * (az * vx - ax * vz), 2 * (ax * vy - ay * vx)
+        p = (
+            px + vx + aw * tx + ay * tz - az * ty,
+            py + vy + aw * ty + az * tx - ax * tz,
+            pz + vz + aw * tz + ax * ty - ay * tx,
+        )
+        all_q.append(jnp.stack(q, -1))
+        all_p.append(jnp.stack(p, -1))
+    order = np.argsort(np.concatenate([np.array(level) for level in levels]))
+    frames = motion.root.shape[0]
+    return Kinematics(
+        positions_world=jnp.moveaxis(jnp.concatenate(all_p)[order], 0, 1),
+        rotations_world=jnp.moveaxis(jnp.concatenate(all_q)[order], 0, 1),
+        rotations_parent=jnp.asarray(motion.rotations),
+        dt=jnp.asarray(motion.dt),
+        signals=jnp.zeros((frames, 0)) if signals is None else signals,
+    )
+
+
+def bind_kinematics(skeleton: Skeleton) -> tuple[Float[Array, "joints 3"], Float[Array, "joints 4"]]:
+    """World position [m] and rotation of every joint in the bind pose."""
+    kin = forward_kinematics(skeleton, rest_motion(skeleton))
+    return kin.positions_world[0], kin.rotations_world[0]
+
+
+def joint_angles(a: Motion, b: Motion) -> Float[Array, "frames joints"]:
+    """The angle [rad] between two motions of one skeleton, per frame and joint."""
+    return rotation.angle_between(jnp.asarray(a.rotations), jnp.asarray(b.rotations))
