@@ -1,0 +1,183 @@
+"""An adaptation problem is data: a character, a base motion, controls, named terms and weights."""
+
+import abc
+from collections.abc import Callable, Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float, PyTree
+
+from motionfit._character import Character
+from motionfit._control import Control, Correction, turned
+from motionfit._motion import Kinematics, Motion, forward_kinematics
+from motionfit._types import AnyArray, InputError
+
+
+def _array(x):
+    """Numbers become arrays: as Python floats they would be static, and each new value would recompile."""
+    return jnp.asarray(x, dtype=float) if isinstance(x, float | int) else x
+
+
+class Term(eqx.Module):
+    """A wish about the motion, as residuals over Kinematics.
+
+    `residual` is dimensionless: divided by a `sigma` that carries the unit ("5 mm counts as 1"). Its leading axis
+    are the frames. A term is *frame-local* when its row of frame t depends on the kinematics of frame t alone;
+    then the fit needs one Jacobian product per control instead of one per control point. Velocities,
+    accelerations and the like are not: they say `frame_local = False`.
+    """
+
+    @property
+    def frame_local(self) -> bool:
+        return True
+
+    @abc.abstractmethod
+    def residual(self, kin: Kinematics) -> Float[Array, "frames ..."]:
+        """Dimensionless residuals, frames first."""
+
+
+class Custom(Term):
+    """A term from a plain function: `fn(kin, args) -> residual (frames, ...)`.
+
+    Data goes in `args` (numbers become arrays there), so that a new value does not recompile. Since the function
+    may look at neighbouring frames it is not taken for frame-local unless `frame_local=True` says so.
+    """
+
+    fn: Callable = eqx.field(static=True)
+    args: PyTree = eqx.field(converter=lambda tree: jax.tree.map(_array, tree), default=None)
+    local: bool = eqx.field(static=True, default=False)
+
+    @property
+    def frame_local(self) -> bool:
+        return self.local
+
+    def residual(self, kin: Kinematics) -> Float[Array, "frames ..."]:
+        return self.fn(kin, self.args)
+
+
+class Energy(eqx.Module):
+    """A scalar from a plain function, `fn(kin, args) -> energy`; for blocks with a minimiser (BFGS, ...) only."""
+
+    fn: Callable = eqx.field(static=True)
+    args: PyTree = eqx.field(converter=lambda tree: jax.tree.map(_array, tree), default=None)
+
+    def energy(self, kin: Kinematics) -> Float[Array, ""]:
+        return self.fn(kin, self.args)
+
+
+class During(Term):
+    """Another term, in some frames only: its rows are multiplied by the mask (0..1 per frame)."""
+
+    term: Term
+    mask: Float[AnyArray, " frames"]
+
+    @property
+    def frame_local(self) -> bool:
+        return self.term.frame_local
+
+    def residual(self, kin: Kinematics) -> Float[Array, "frames ..."]:
+        rows = self.term.residual(kin)
+        return rows * jnp.asarray(self.mask).reshape(-1, *(1,) * (rows.ndim - 1))
+
+
+class Robust(Term):
+    """Another term under the pseudo-Huber loss: quadratic for small rows, linear beyond `c` (dimensionless).
+
+    With 1/2 rho(r)^2 = c^2 (sqrt(1 + (r/c)^2) - 1), so the squared output is the loss itself.
+    """
+
+    term: Term
+    c: Float[AnyArray, ""] = eqx.field(converter=_array, default=2.0)
+
+    @property
+    def frame_local(self) -> bool:
+        return self.term.frame_local
+
+    def residual(self, kin: Kinematics) -> Float[Array, "frames ..."]:
+        scaled = self.term.residual(kin) / self.c
+        # 2 (sqrt(1+s^2) - 1) = 2 s^2 / (sqrt(1+s^2) + 1): no cancellation for small s, and its root is
+        # s * sqrt(2 / (...)), which keeps the sign and is smooth at zero
+        return self.c * scaled * jnp.sqrt(2.0 / (jnp.sqrt(1.0 + scaled * scaled) + 1.0))
+
+
+class Problem(eqx.Module):
+    """character + base motion + controls + named terms + weights. Immutable; vmap it, differentiate it, edit it
+    with `eqx.tree_at`.
+
+    `weights` are dimensionless and linear (1 where not given).
+    """
+
+    character: Character
+    motion: Motion
+    terms: dict[str, Term | Energy]
+    controls: tuple[Control, ...]
+    weights: dict[str, Float[AnyArray, ""]]
+
+    def __init__(
+        self,
+        character: Character,
+        motion: Motion,
+        terms: Mapping[str, Term | Energy],
+        controls: tuple[Control, ...] = (),
+        weights: Mapping[str, float | Array] | None = None,
+    ):
+        unknown = set(weights or {}) - set(terms)
+        if unknown:
+            raise InputError(f"weights for unknown terms {sorted(unknown)}; terms: {', '.join(terms)}")
+        names = [c.name for c in controls]
+        if len(set(names)) != len(names):
+            raise InputError(f"control names must differ, got {', '.join(names)}")
+        if len(motion.skeleton.names) != len(character.skeleton.names):
+            raise InputError(f"the motion has {len(motion.skeleton.names)} joints, the character "
+                             f"{len(character.skeleton.names)}; put it on with motionfit.onto(motion, skeleton)")  # fmt: skip
+        self.character, self.motion, self.terms, self.controls = character, motion, dict(terms), tuple(controls)
+        self.weights = {k: _array((weights or {}).get(k, 1.0)) for k in terms}
+
+    def kinematics(self, signals: Float[AnyArray, "frames controls"] | None = None) -> Kinematics:
+        """Forward kinematics of the base motion with control signals [rad] on top (None: the base motion)."""
+        motion = self.motion
+        if signals is not None and self.controls:
+            rotations = turned(motion, self.controls, signals)
+            motion = Motion(motion.skeleton, motion.root, rotations, motion.dt, motion.translations)
+        else:
+            signals = jnp.zeros((motion.root.shape[0], len(self.controls)))
+        return forward_kinematics(self.character.skeleton, motion, signals)
+
+    def costs(self, correction: Correction | None = None) -> dict[str, float]:
+        """The weighted cost of each term, 1/2 w sum r^2 or w E."""
+        values = _costs(self, None if correction is None else correction.points)
+        return {k: float(v) for k, v in values.items()}
+
+    def report(self, correction: Correction | None = None) -> str:
+        """A table of the terms: weight, cost and the frame where it is worst."""
+        kin = self.kinematics(None if correction is None else correction.signals())
+        lines = [f"{'term':<28} {'weight':>9} {'cost':>12}  worst frame"]
+        costs = self.costs(correction)
+        for name, term in self.terms.items():
+            worst = "-"
+            if isinstance(term, Term):
+                rows = np.asarray(term.residual(kin))
+                worst = str(int(np.square(rows.reshape(len(rows), -1)).sum(-1).argmax()))
+            lines.append(f"{name:<28} {float(self.weights[name]):>9.3g} {costs[name]:>12.5g}  {worst}")
+        return "\n".join(lines)
+
+
+@eqx.filter_jit
+def _costs(problem: Problem, points) -> dict[str, Array]:
+    signals = None
+    if points is not None and problem.controls:
+        signals = jnp.stack([c.signal(p) for c, p in zip(problem.controls, points, strict=True)], axis=1)
+    kin = problem.kinematics(signals)
+    return {k: problem.weights[k] * term_cost(t, kin) for k, t in problem.terms.items()}
+
+
+def term_cost(term: Term | Energy, kin: Kinematics) -> Float[Array, ""]:
+    """1/2 sum r^2 of a term, or the energy itself: see the cost convention in _types.py."""
+    if isinstance(term, Energy):
+        return term.energy(kin)
+    return 0.5 * jnp.sum(jnp.square(term.residual(kin)))
+
+

@@ -1,0 +1,48 @@
+"""Splines over time: what a control's points mean in each frame."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float, Int
+from scipy.interpolate import BSpline
+
+from motionfit._types import AnyArray, InputError
+
+DEGREE = 3
+
+
+class Basis(eqx.Module):
+    """A cubic B-spline basis sampled at the frames of a clip.
+
+    In frame t the four control points from `first[t]` on count, with the `values[t]`, which sum to one. So a
+    control point touches only the frames under its support, and equal control points give a constant signal.
+    """
+
+    first: Int[AnyArray, " frames"]
+    values: Float[AnyArray, "frames 4"]
+    count: int = eqx.field(static=True)
+
+    def __call__(self, points: Float[AnyArray, " points"]) -> Float[Array, " frames"]:
+        """The signal that control points make, frame by frame."""
+        points = jnp.asarray(points)
+        return sum(points[jnp.asarray(self.first) + k] * self.values[:, k] for k in range(DEGREE + 1))  # type: ignore
+
+
+def bspline_basis(frame_count: int, dt: float, spacing: float) -> Basis:
+    """A cubic B-spline basis with a knot about every `spacing` [s] on `frame_count` frames of `dt` [s].
+
+    The knots are uniform and go on past both ends, so the first and the last frame have four control points like
+    every other. Clips shorter than one spacing get a single span.
+    """
+    if spacing <= 0:
+        raise InputError(f"knot spacing must be above 0 s, got {spacing}")
+    duration = max((frame_count - 1) * float(dt), 1e-9)
+    spans = max(1, round(duration / spacing))
+    step = duration / spans
+    knots = step * np.arange(-DEGREE, spans + DEGREE + 1)
+    # the last frame lies on the last knot; SciPy takes it into the last span only if it is not past it
+    times = np.clip(np.arange(frame_count) * float(dt), 0.0, knots[spans + DEGREE])
+    rows = BSpline.design_matrix(times, knots, DEGREE)
+    first = rows.indices.reshape(frame_count, DEGREE + 1)
+    return Basis(first[:, 0].astype(np.int32), rows.data.reshape(frame_count, DEGREE + 1), spans + DEGREE)

@@ -1,0 +1,14 @@
+"""Built-in terms: wishes about a motion, as residuals over Kinematics."""
+
+from motionfit.terms.penetration import CapsuleClearance, JointClearance, SkinClearance
+from motionfit.terms.pose import Effort, JointTracking, RotationTracking, Smoothness
+
+__all__ = [
+    "CapsuleClearance",
+    "Effort",
+    "JointClearance",
+    "JointTracking",
+    "RotationTracking",
+    "SkinClearance",
+    "Smoothness",
+]

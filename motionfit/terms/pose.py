@@ -1,0 +1,69 @@
+"""Terms that keep the motion itself: small, smooth corrections, and poses near a target."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from motionfit import rotation
+from motionfit._motion import Kinematics
+from motionfit._problem import Term
+from motionfit._types import AnyArray
+
+
+def _array(x):
+    return jnp.asarray(x, dtype=float) if isinstance(x, float | int) else x
+
+
+class Effort(Term):
+    """The alpha x^2 of thesis (4.6) and (4.10): every control near zero.
+
+    Counted per frame instead of per control point, so that neither the knot spacing nor the clip's length shifts
+    the balance with the penetration. `sigma` [rad] is one number or one per control.
+    """
+
+    sigma: Float[AnyArray, "*controls"] = eqx.field(converter=_array, default=1.0)
+
+    def residual(self, kin: Kinematics) -> Float[Array, "frames controls"]:
+        return kin.signals / self.sigma
+
+
+class Smoothness(Term):
+    """Second time derivative of every control near zero: corrections that bend no more than they must.
+
+    `sigma` [rad/s^2]. Central differences; the first and last frame have none.
+    """
+
+    sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=30.0)
+
+    @property
+    def frame_local(self) -> bool:
+        return False
+
+    def residual(self, kin: Kinematics) -> Float[Array, "frames controls"]:
+        bend = (kin.signals[2:] - 2 * kin.signals[1:-1] + kin.signals[:-2]) / jnp.square(kin.dt)
+        return jnp.pad(bend, ((1, 1), (0, 0)))[: len(kin.signals)] / self.sigma
+
+
+class JointTracking(Term):
+    """World positions of some joints near a target: (p - target) / sigma, `target` and `sigma` in [m]."""
+
+    joints: tuple[int, ...] = eqx.field(static=True)
+    target_world: Float[AnyArray, "frames tracked 3"]
+    sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.01)
+
+    def residual(self, kin: Kinematics) -> Float[Array, "frames tracked 3"]:
+        return (kin.positions_world[:, np.array(self.joints)] - jnp.asarray(self.target_world)) / self.sigma
+
+
+class RotationTracking(Term):
+    """World rotations of some joints near a target: the rotation vector between them over `sigma` [rad]."""
+
+    joints: tuple[int, ...] = eqx.field(static=True)
+    target_world: Float[AnyArray, "frames tracked 4"]
+    sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.05)
+
+    def residual(self, kin: Kinematics) -> Float[Array, "frames tracked 3"]:
+        turned = kin.rotations_world[:, np.array(self.joints)]
+        return rotation.log(rotation.multiply(rotation.conjugate(self.target_world), turned)) / self.sigma
