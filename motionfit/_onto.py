@@ -1,0 +1,154 @@
+"""Put a clip on another skeleton: by roles, through the bind poses' world orientations."""
+
+import numpy as np
+from jaxtyping import Float
+
+from motionfit import rotation
+from motionfit._motion import Motion, bind_kinematics, forward_kinematics
+from motionfit._skeleton import SIDES, Skeleton
+
+IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+UP = np.array([0.0, 1.0, 0.0])
+
+
+def onto(motion: Motion, skeleton: Skeleton) -> Motion:
+    """The motion as another skeleton would do it.
+
+    Equal joint names do not mean equal bone axes or rest poses, so local rotations are never copied. A joint with
+    a role turns in the world as the same role does in the clip, away from the rest pose: Q = D A Q_bind, where
+    D = Q_clip Q_clip_rest^-1 and A is the smallest rotation that lays the character's bind bone along the clip's
+    rest bone (a T-pose clip on an A-pose character). The trunk, neck and head stand upright in both and take
+    A = 1, the foot only its yaw, so that soles stay flat; hands and toes go on like the bone before them. Joints
+    that only one side has stay at bind. The root path is scaled with the leg length.
+
+    A skeleton that is truly the same gets the motion back bit for bit.
+    """
+    source = motion.skeleton
+    if source.is_same(skeleton):
+        return Motion(skeleton, motion.root, motion.rotations, motion.dt, motion.translations)
+    required = ("hips", *(f"{s}_{r}" for s in SIDES for r in ("thigh", "calf", "foot", "upper_arm", "forearm")))
+    source.require(*required)
+    skeleton.require(*required)
+
+    clip_positions, clip_rest = (np.asarray(x, float) for x in bind_kinematics(source))
+    positions, bind = (np.asarray(x, float) for x in bind_kinematics(skeleton))
+    # turn the character's bind pose to face the way that the clip's rest pose faces
+    heading = np.asarray(rotation.between(_facing(skeleton, positions), _facing(source, clip_positions)))
+    positions, bind = _turn(heading, positions), np.asarray(rotation.multiply(heading, bind))
+
+    world = np.asarray(forward_kinematics(source, motion).rotations_world, float)
+    away = np.asarray(rotation.multiply(world, rotation.conjugate(clip_rest)))  # D, per clip joint
+    align = _alignments(source, clip_positions, skeleton, positions)
+    targets = _targets(source, skeleton, away)
+
+    frames = motion.frame_count
+    local = np.tile(np.asarray(skeleton.rest_rotations, float), (frames, 1, 1))
+    turned = np.empty((frames, len(skeleton.names), 4))
+    for joint, parent in enumerate(skeleton.parents):
+        above = turned[:, parent] if parent >= 0 else np.tile(heading if joint not in targets else IDENTITY, (frames, 1))
+        if joint in targets:
+            laid = np.asarray(rotation.multiply(align.get(skeleton.nearest_role(joint), IDENTITY), bind[joint]))
+            turned[:, joint] = np.asarray(rotation.multiply(targets[joint], laid))
+            local[:, joint] = np.asarray(rotation.multiply(rotation.conjugate(above), turned[:, joint]))
+        else:
+            turned[:, joint] = np.asarray(rotation.multiply(above, local[:, joint]))
+            if parent < 0:
+                local[:, joint] = turned[:, joint]
+    local /= np.linalg.norm(local, axis=-1, keepdims=True)
+    return Motion(skeleton, _root_path(motion, clip_positions, skeleton, positions), local, motion.dt)
+
+
+def leg_length(skeleton: Skeleton, positions: Float[np.ndarray, "joints 3"] | None = None) -> float:
+    """Mean length [m] of thigh and calf together."""
+    if positions is None:
+        positions = np.asarray(bind_kinematics(skeleton)[0], float)
+    total = 0.0
+    for side in SIDES:
+        thigh, calf, foot = (positions[skeleton.joint(f"{side}_{r}")] for r in ("thigh", "calf", "foot"))
+        total += np.linalg.norm(calf - thigh) + np.linalg.norm(foot - calf)
+    return float(total / 2)
+
+
+def _turn(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    return np.asarray(rotation.rotate(np.broadcast_to(q, (*v.shape[:-1], 4)), v))
+
+
+def _facing(skeleton: Skeleton, positions: np.ndarray) -> np.ndarray:
+    """The horizontal direction that the rest pose faces: (left - right) x up."""
+    across = sum(
+        positions[skeleton.joint(f"left_{r}")] - positions[skeleton.joint(f"right_{r}")] for r in ("thigh", "upper_arm")
+    )
+    forward = np.cross(across, UP)
+    return forward / max(float(np.linalg.norm(forward)), 1e-9)
+
+
+def _bone(skeleton: Skeleton, positions: np.ndarray, role: str) -> np.ndarray | None:
+    following = {"upper_arm": "forearm", "forearm": "hand", "thigh": "calf", "calf": "foot", "foot": "toe"}
+    side, _, kind = role.partition("_")
+    joint, end = skeleton.find(role), skeleton.find(f"{side}_{following[kind]}")
+    return None if joint is None or end is None else positions[end] - positions[joint]
+
+
+def _alignments(
+    source: Skeleton, clip_positions: np.ndarray, skeleton: Skeleton, positions: np.ndarray
+) -> dict[str | None, np.ndarray]:
+    """A per role: lays the character's bind bone along the clip's rest bone."""
+    align: dict[str | None, np.ndarray] = {}
+    for side in SIDES:
+        for kind, heir in (
+            ("upper_arm", None), ("forearm", "hand"), ("thigh", None), ("calf", None), ("foot", "toe")
+        ):  # fmt: skip
+            role = f"{side}_{kind}"
+            mine, theirs = _bone(skeleton, positions, role), _bone(source, clip_positions, role)
+            if mine is None or theirs is None:
+                continue
+            if kind == "foot":
+                mine, theirs = (v * np.array([1.0, 0.0, 1.0]) for v in (mine, theirs))
+            align[role] = np.asarray(rotation.between(mine, theirs))
+            if heir:
+                align[f"{side}_{heir}"] = align[role]
+    return align
+
+
+def _targets(source: Skeleton, skeleton: Skeleton, away: np.ndarray) -> dict[int, np.ndarray]:
+    """Joint of the character -> how it turns away from rest in the world, (frames, 4)."""
+    targets: dict[int, np.ndarray] = {}
+    for role, joint in skeleton.roles:
+        if (match := source.find(role)) is not None and not role.startswith(("spine_", "neck_")):
+            targets[joint] = away[:, match]
+    for kind in ("spine", "neck"):
+        mine, theirs = skeleton.chain(kind), source.chain(kind)
+        for k, joint in enumerate(mine):
+            if not theirs:
+                continue
+            # chains of different length share their turn evenly; their tops agree
+            place = (k + 1) / len(mine) * len(theirs) - 1
+            below, share = int(np.floor(max(place, 0.0))), max(place, 0.0) % 1
+            low, high = away[:, theirs[below]], away[:, theirs[min(below + 1, len(theirs) - 1)]]
+            targets[joint] = low if share == 0 else np.asarray(rotation.slerp(low, high, np.full(len(low), share)))
+    known = set(targets)
+    names = {name.casefold(): j for j, name in enumerate(source.names)}
+    for joint, name in enumerate(skeleton.names):
+        # fingers and other joints without a role that both have; they follow the alignment of their limb
+        match = names.get(name.casefold())
+        if joint not in known and match is not None and match not in source.role_of_joint and skeleton.parents[joint] >= 0:
+            targets[joint] = away[:, match]
+    return targets
+
+
+def _root_path(motion: Motion, clip_positions: np.ndarray, skeleton: Skeleton, positions: np.ndarray) -> np.ndarray:
+    """The root path scaled with the leg length, its height measured between hip joints and ankles."""
+    source = motion.skeleton
+    scale = leg_length(skeleton, positions) / leg_length(source, clip_positions)
+
+    def above_leg(s: Skeleton, p: np.ndarray) -> float:
+        """What of the root's height is not leg: root over the hip joints, ankle over the lowest toe."""
+        feet = [s.joint(f"{side}_foot") for side in SIDES]
+        toes = [j for side in SIDES if (j := s.find(f"{side}_toe")) is not None] or feet
+        hips = np.mean([p[s.joint(f"{side}_thigh")][1] for side in SIDES])
+        return float(p[0][1] - hips + np.mean(p[feet, 1]) - np.min(p[toes, 1]))
+
+    root = np.asarray(motion.root, float) * scale
+    root[:, 1] += above_leg(skeleton, positions) - scale * above_leg(source, clip_positions)
+    return root
+

@@ -1,0 +1,281 @@
+"""Every measure, one function each, with its definition and source.
+
+Penetration is judged twice: on fitted volumes, and on the skinned mesh itself by generalised winding numbers
+(Jacobson et al. 2013; Barill et al. 2018, through libigl), so that volumes are never judged by volumes alone.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from motionfit import rotation
+from motionfit._character import PARTS, Character
+from motionfit._motion import Motion, forward_kinematics, joint_angles
+from motionfit._skinning import skin_points
+from motionfit._types import AnyArray
+from motionfit.shape.pairs import PAIRS, Pair
+
+TOLERANCE = 0.01  # [m]: the "1 cm" of every frames_over_1cm
+
+
+# --- penetration -----------------------------------------------------------------------------------------------
+
+
+class SkinDepths(NamedTuple):
+    """What `skin_depths` measured: per frame and pair the depth [m] (0 where nothing is inside), and the share of
+    all probed vertices that were inside (over all frames)."""
+
+    depth: Float[np.ndarray, "frames pairs"]
+    inside_ratio: float
+    frames: np.ndarray
+
+
+@jax.jit
+def _posed_vertices(skeleton, motion, vertices, joints, weights):
+    return skin_points(skeleton, forward_kinematics(skeleton, motion), vertices, joints, weights)
+
+
+def posed_vertices(character: Character, motion: Motion) -> Float[np.ndarray, "frames vertices 3"]:
+    """World vertices [m] of the skin in every frame, on the host."""
+    skin = character.skin
+    return np.asarray(_posed_vertices(character.skeleton, motion, skin.vertices_bind, skin.joints, skin.weights))
+
+
+class _PartSurface(NamedTuple):
+    vertices: np.ndarray  # indices of the part's vertices in the whole mesh
+    triangles: np.ndarray  # the part's triangles, in whole-mesh indices
+    used: np.ndarray  # the vertices that the triangles use
+    local: np.ndarray  # the triangles, in indices into `used`
+
+
+def _surfaces(character: Character, parts: Sequence[str]) -> dict[str, _PartSurface]:
+    faces, part_of_vertex = np.asarray(character.skin.faces), character.part_of_vertex
+    # a triangle across a border belongs to the part of two of its corners
+    of_face = np.median(np.sort(part_of_vertex[faces], axis=1), axis=1).astype(int)
+    surfaces = {}
+    for part in parts:
+        index = PARTS.index(part)
+        triangles = faces[of_face == index]
+        used, local = np.unique(triangles, return_inverse=True)
+        surfaces[part] = _PartSurface(
+            np.flatnonzero(part_of_vertex == index), triangles, used, local.reshape(-1, 3).astype(np.int64)
+        )
+    return surfaces
+
+
+def _inside_depths(points: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) -> Float[np.ndarray, " points"]:
+    """Depth [m] of points inside a surface (generalised winding number > 1/2), 0 for those outside."""
+    import igl
+
+    depth = np.zeros(len(points))
+    if len(triangles) == 0:
+        return depth
+    near = np.flatnonzero(((points >= vertices.min(0)) & (points <= vertices.max(0))).all(-1))
+    if len(near) == 0:
+        return depth
+    near = near[np.asarray(igl.fast_winding_number(vertices, triangles, points[near])) > 0.5]
+    if len(near):
+        squared = np.asarray(igl.point_mesh_squared_distance(points[near], vertices, triangles)[0])
+        depth[near] = np.sqrt(np.maximum(squared, 0.0))
+    return depth
+
+
+def skin_depths(
+    character: Character,
+    motion: Motion,
+    pairs: Sequence[Pair] = PAIRS,
+    *,
+    step: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> SkinDepths:
+    """Per pair of parts and frame, how deep the deepest vertex of either part is inside the other's surface.
+
+    Parts are the vertices by joint of greatest weight; a surface is a part's own triangles, open at the joints,
+    which generalised winding numbers allow. Vertices that are inside at bind do not count: they are the joint
+    itself. `step` looks at every step-th frame only.
+    """
+    parts = sorted({p for pair in pairs for p in (pair.first, pair.second)})
+    surfaces = _surfaces(character, parts)
+    bind = np.asarray(character.skin.vertices_bind, float)
+    # (probing part, surface part) in both directions of every pair
+    directions = [(k, a, b) for k, pair in enumerate(pairs) for a, b in (pair[:2], pair[1::-1])]
+    by_surface: dict[str, list[tuple[int, str]]] = {}
+    for k, a, b in directions:
+        by_surface.setdefault(b, []).append((k, a))
+
+    def depths_at(vertices: np.ndarray, counted: dict[tuple[int, str], np.ndarray] | None):
+        found = {}
+        for surface, probes in by_surface.items():
+            mesh = surfaces[surface]
+            groups = [surfaces[a].vertices for _, a in probes]
+            if counted is not None:
+                groups = [g[counted[k, a]] for g, (k, a) in zip(groups, probes, strict=True)]
+            points = vertices[np.concatenate(groups)] if groups else np.zeros((0, 3))
+            depth = _inside_depths(points, vertices[mesh.used], mesh.local)
+            for probe, part in zip(probes, np.split(depth, np.cumsum([len(g) for g in groups])[:-1]), strict=True):
+                found[probe] = part
+        return found
+
+    counted: dict[tuple[int, str], Bool[np.ndarray, "..."]] = {k: d == 0 for k, d in depths_at(bind, None).items()}
+    probed = max(sum(int(c.sum()) for c in counted.values()), 1)
+    frames = np.arange(0, motion.frame_count, step)
+    result, inside = np.zeros((len(frames), len(pairs))), 0
+    chunk = 64  # frames skinned at once: the whole clip would not fit for long clips
+    for start in range(0, len(frames), chunk):
+        some = frames[start : start + chunk]
+        # always whole chunks, so that the skinning compiles once
+        padded = np.append(some, np.full(chunk - len(some), some[-1]))
+        posed = posed_vertices(character, motion[padded]).astype(float)
+        for i in range(len(some)):
+            for (k, _), depth in depths_at(posed[i], counted).items():
+                if len(depth):
+                    result[start + i, k] = max(result[start + i, k], depth.max())
+                    inside += int((depth > 0).sum())
+        if progress is not None:
+            progress(min(start + chunk, len(frames)), len(frames))
+    return SkinDepths(result, inside / (probed * max(len(frames), 1)), frames)
+
+
+def penetration_summary(
+    excess: Float[np.ndarray, "frames pairs"], pairs: Sequence[Pair] = PAIRS
+) -> dict:
+    """report.json's penetration entry from excess depths [m]: how much deeper than on the reference."""
+    excess = np.maximum(np.nan_to_num(np.asarray(excess, float)), 0.0)
+    return {
+        "excess_max_m": float(excess.max(initial=0.0)),
+        "excess_mean_m": float(excess.max(axis=1, initial=0.0).mean()) if len(excess) else 0.0,
+        "frames_over_1cm": float((excess > TOLERANCE).any(axis=1).mean()) if len(excess) else 0.0,
+        "pairs": {
+            pair.name: {
+                "excess_max_m": float(excess[:, k].max(initial=0.0)),
+                "frames_over_1cm": float((excess[:, k] > TOLERANCE).mean()) if len(excess) else 0.0,
+            }
+            for k, pair in enumerate(pairs)
+        },
+    }
+
+
+# --- fidelity: against the source clip -------------------------------------------------------------------------
+
+
+def joint_angle_deviation(motion: Motion, source: Motion) -> tuple[float, float]:
+    """Mean over frames and joints, and maximum, of the angle [rad] between each joint's rotation and the source's."""
+    angles = np.asarray(joint_angles(motion, source))
+    return float(angles.mean()), float(angles.max())
+
+
+def forearm_direction(motion: Motion, source: Motion) -> float | None:
+    """Mean angle [rad] between the forearms' world directions and the source's: thesis (4.7)."""
+    skeleton = motion.skeleton
+    sides = [(skeleton.find(f"{s}_forearm"), skeleton.find(f"{s}_hand")) for s in ("left", "right")]
+    sides = [(f, h) for f, h in sides if f is not None and h is not None]
+    if not sides:
+        return None
+    kins = [forward_kinematics(m.skeleton, m) for m in (motion, source)]
+    angles = []
+    for forearm, hand in sides:
+        a, b = (rotation.normalize(k.positions_world[:, hand] - k.positions_world[:, forearm]) for k in kins)
+        angles.append(jnp.arctan2(rotation.safe_norm(jnp.cross(a, b)), jnp.sum(a * b, axis=-1)))
+    return float(jnp.mean(jnp.stack(angles)))
+
+
+def root_path_ratio(motion: Motion, source: Motion) -> float | None:
+    """Length of the root's horizontal path over that of the source; None where the source stands still."""
+
+    def length(m: Motion) -> float:
+        return float(np.linalg.norm(np.diff(np.asarray(m.root, float)[:, [0, 2]], axis=0), axis=-1).sum())
+
+    return length(motion) / length(source) if length(source) > 0.05 else None
+
+
+# --- smoothness -------------------------------------------------------------------------------------------------
+
+
+def derivative_ratio(motion: Motion, source: Motion, order: int) -> float | None:
+    """Mean over frames and joints of the norm of the order-th time derivative of the joints' world positions, over
+    that of the source: 2 is acceleration, 3 jerk. Flash & Hogan 1985 take jerk as the measure of smoothness. None
+    for clips too short, or a source at rest."""
+    if motion.frame_count <= order:
+        return None
+    means = []
+    for m in (motion, source):
+        # float64: the third difference of float32 positions at 120 fps is mostly rounding
+        positions = _positions64(m)
+        means.append(float(np.linalg.norm(np.diff(positions, order, axis=0), axis=-1).mean()))
+    return means[0] / means[1] if means[1] > 1e-9 else None
+
+
+def _positions64(motion: Motion) -> Float[np.ndarray, "frames joints 3"]:
+    """Joint positions [m] in double precision whatever JAX's mode is, joint after joint in NumPy."""
+    from scipy.spatial.transform import Rotation
+
+    skeleton, rotations = motion.skeleton, np.asarray(motion.rotations, float)
+    offsets = np.asarray(skeleton.offsets, float)
+    world: list[Rotation] = []
+    positions = np.zeros((motion.frame_count, len(skeleton.names), 3))
+    for joint, parent in enumerate(skeleton.parents):
+        turn = Rotation.from_quat(rotations[:, joint], scalar_first=True)
+        if parent < 0:
+            positions[:, joint] = np.asarray(motion.root, float)
+            world.append(turn)
+            continue
+        offset = offsets[joint] if motion.translations is None else np.asarray(motion.translations, float)[:, joint]
+        positions[:, joint] = positions[:, parent] + world[parent].apply(offset)
+        world.append(world[parent] * turn)
+    return positions
+
+
+# --- the whole entry --------------------------------------------------------------------------------------------
+
+
+def measure(
+    character: Character,
+    motion: Motion,
+    source: Motion,
+    *,
+    volume_excess: Float[AnyArray, "frames pairs"] | None = None,
+    skin: SkinDepths | None = None,
+    reference: SkinDepths | None = None,
+    pairs: Sequence[Pair] = PAIRS,
+) -> dict:
+    """One M of report.json (schema 1): penetration on volumes and skin, fidelity and smoothness against `source`.
+
+    `volume_excess` [m] per frame and pair comes from `motionfit.adapt.volume_depths`, `skin` and `reference` from
+    `skin_depths`. Feet and balance are null: they are measured by the parts of motionfit that treat them.
+    """
+    del character
+    penetration: dict = {"excess_max_m": None, "excess_mean_m": None, "frames_over_1cm": None, "pairs": {}}
+    if volume_excess is not None:
+        penetration = penetration_summary(np.asarray(volume_excess), pairs)
+    if skin is not None:
+        excess = skin.depth - (0.0 if reference is None else reference.depth)
+        summary = penetration_summary(excess, pairs)
+        penetration["skin"] = {
+            "excess_max_m": summary["excess_max_m"],
+            "frames_over_1cm": summary["frames_over_1cm"],
+            "inside_ratio": float(skin.inside_ratio),
+            "inside_ratio_reference": None if reference is None else float(reference.inside_ratio),
+            "pairs": summary["pairs"],
+        }
+    mean, worst = joint_angle_deviation(motion, source)
+    return {
+        "penetration": penetration,
+        "feet": dict.fromkeys(("slide_max_m_s", "slide_p95_m_s", "slide_path_m", "contact_frames",
+                               "ground_penetration_max_m", "floating_max_m")),
+        "balance": dict.fromkeys(("zmp_distance_mean_m", "zmp_distance_sd_m", "excess_over_reference_mean_m",
+                                  "supported_frames")),
+        "fidelity": {
+            "joint_angle_mean_rad": mean,
+            "joint_angle_max_rad": worst,
+            "forearm_direction_mean_rad": forearm_direction(motion, source),
+            "root_path_ratio": root_path_ratio(motion, source),
+        },
+        "smoothness": {
+            "jerk_ratio": derivative_ratio(motion, source, 3),
+            "acceleration_ratio": derivative_ratio(motion, source, 2),
+        },
+    }  # fmt: skip

@@ -1,0 +1,129 @@
+"""Terms that keep body parts out of each other: by joints, by capsules, and by skin points against volumes.
+
+All three count *excess* only: what goes beyond `allowed`, the overlap that the same pair shows on the reference
+body in the same frame (method: adjacent segments always overlap a little at the joint).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from motionfit import rotation
+from motionfit._motion import Kinematics
+from motionfit._problem import Term
+from motionfit._skeleton import Skeleton
+from motionfit._skinning import skin_points
+from motionfit._types import AnyArray
+from motionfit.shape.distance import capsule_depth, cylinder_depth
+from motionfit.shape.volumes import Probes, Section, Volumes
+
+
+def _array(x):
+    return jnp.asarray(x, dtype=float) if isinstance(x, float | int) else x
+
+
+def hinge(depth: Float[AnyArray, "..."], width: float | Float[AnyArray, ""]) -> Float[Array, "..."]:
+    """max(0, depth) with its corner rounded over `width` [m], zero *inside* included: 0 for depth <= 0,
+    depth^2 / (2 width) up to the width, then depth - width / 2. Once continuously differentiable."""
+    positive = jnp.maximum(depth, 0.0)
+    return jnp.where(positive < width, positive * positive / (2 * width), positive - width / 2)
+
+
+class JointClearance(Term):
+    """Joints at a threshold distance: the d_i of thesis (4.6), (4.10) and (4.11).
+
+    `first`, `second` are joint indices per pair, `min_distance` [m] per pair, or per frame and pair. With
+    `frontal` the distance is measured on the plane of the vertical and the line between the thighs, which is the
+    matrix M of (4.11): the actual separation of the legs. `sigma` [m].
+    """
+
+    first: tuple[int, ...] = eqx.field(static=True)
+    second: tuple[int, ...] = eqx.field(static=True)
+    min_distance: Float[AnyArray, "*frames pairs"]
+    sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.01)
+    width: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.002)
+    frontal: tuple[int, int] | None = eqx.field(static=True, default=None)
+
+    def distance(self, kin: Kinematics) -> Float[Array, "frames pairs"]:
+        gap = kin.positions_world[:, np.array(self.first)] - kin.positions_world[:, np.array(self.second)]
+        if self.frontal is not None:
+            left, right = (kin.positions_world[:, j] for j in self.frontal)
+            across = rotation.normalize((left - right) * jnp.array([1.0, 0.0, 1.0], gap.dtype))[:, None]
+            lateral = jnp.sum(gap * across, axis=-1)
+            gap = jnp.stack([lateral, gap[..., 1]], axis=-1)
+        return rotation.safe_norm(gap)
+
+    def residual(self, kin: Kinematics) -> Float[Array, "frames pairs"]:
+        short = jnp.asarray(self.min_distance).reshape(-1, len(self.first)) - self.distance(kin)
+        return hinge(short, self.width) / self.sigma
+
+
+class CapsuleClearance(Term):
+    """One volume per segment against another, by the exact segment distance (capsules) or the thesis's flat-ended
+    cylinders. `allowed` [m] is the depth that does not count, per pair or per frame and pair; `sigma` [m]."""
+
+    volumes: Volumes
+    first: tuple[int, ...] = eqx.field(static=True)
+    second: tuple[int, ...] = eqx.field(static=True)
+    allowed: Float[AnyArray, "*frames pairs"]
+    sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.01)
+    width: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.002)
+
+    def depth(self, kin: Kinematics) -> Float[Array, "frames pairs"]:
+        """Penetration depth [m] of every pair in every frame; negative where there is a gap."""
+        start, end = self.volumes.axes_world(kin)
+        radius = jnp.mean(jnp.asarray(self.volumes.radii), axis=-1)
+        a, b = np.array(self.first), np.array(self.second)
+        rule = cylinder_depth if self.volumes.kind == "cylinder" else capsule_depth
+        return rule(start[:, a], end[:, a], radius[a][None], start[:, b], end[:, b], radius[b][None])
+
+    def residual(self, kin: Kinematics) -> Float[Array, "frames pairs"]:
+        excess = self.depth(kin) - jnp.asarray(self.allowed).reshape(-1, len(self.first))
+        return hinge(excess, self.width) / self.sigma
+
+
+class SkinClearance(Term):
+    """Points of one part's skin against the generalised cylinder of another: one row per frame and pair.
+
+    The row is the Euclidean norm over the points of their excess depth, so its square is the sum over points.
+    `allowed` [m] is the depth that does not count, per frame and pair. `counted` masks, per pair, the probes that
+    lie inside the other part at bind already: those are the joint itself. `sigma` [m].
+    """
+
+    skeleton: Skeleton
+    probes: tuple[Probes, ...]
+    sections: tuple[Section, ...]
+    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)  # (index into probes, index into sections)
+    counted: tuple[Float[AnyArray, " points"], ...]
+    allowed: Float[AnyArray, "frames pairs"]
+    sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.01)
+    width: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.002)
+
+    def point_depths(self, kin: Kinematics) -> list[Float[Array, "frames points"]]:
+        """Depth [m] of every counted point per pair; points that do not count are far outside."""
+        points = [skin_points(self.skeleton, kin, p.points_bind, p.joints, p.weights) for p in self.probes]
+        depths = []
+        for (probe, section), counted in zip(self.pairs, self.counted, strict=True):
+            depth = self.sections[section].depth(self.skeleton, kin, points[probe])
+            depths.append(jnp.where(jnp.asarray(counted) > 0, depth, -1.0))
+        return depths
+
+    def depth(self, kin: Kinematics) -> Float[Array, "frames pairs"]:
+        """Depth [m] of the deepest point of every pair in every frame; negative where all are outside."""
+        return jnp.stack([jnp.max(d, axis=-1) for d in self.point_depths(kin)], axis=-1)
+
+    def residual(self, kin: Kinematics) -> Float[Array, "frames pairs"]:
+        allowed = jnp.asarray(self.allowed)
+        rows = [
+            rotation.safe_norm(hinge(depth - allowed[:, k, None], self.width))
+            for k, depth in enumerate(self.point_depths(kin))
+        ]
+        return jnp.stack(rows, axis=-1) / self.sigma
+
+
+def bind_depths(section: Section, points_bind: Float[AnyArray, "points 3"]) -> Float[np.ndarray, " points"]:
+    """Depth [m] of bind-pose points in a section: which probes are part of the joint itself."""
+    return np.asarray(jax.jit(lambda s, p: s.depth_bind(p))(section, jnp.asarray(points_bind)))
