@@ -3,7 +3,6 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -84,13 +83,17 @@ def resample(motion: Motion, frame_rate: float) -> Motion:
 class Kinematics(eqx.Module):
     """What forward kinematics returns. Computed once per evaluation; every term reads it.
 
-    `positions_world` [m] and `rotations_world` of all joints, the `rotations_parent` they came from, `dt` [s],
-    and `signals`, the values of the problem's controls in each frame [rad] (none without a correction).
+    `positions_world` [m] and `rotations_world` of all joints, the `rotations_parent` they came from, `dt` [s];
+    `skin_rotations` (matrices) and `skin_translations` [m], which take a bind-pose point to the world with each
+    joint, M_j B_j^-1 of thesis (4.20); and `signals`, the values of the problem's controls in each frame [rad]
+    (none without a correction). Under jit, what no term reads is not computed.
     """
 
     positions_world: Positions
     rotations_world: Rotations
     rotations_parent: Rotations
+    skin_rotations: Float[AnyArray, "frames joints 3 3"]
+    skin_translations: Positions
     dt: Float[AnyArray, ""]
     signals: Float[AnyArray, "frames controls"]
 
@@ -103,24 +106,28 @@ def forward_kinematics(
     Level by level over the static tree: all joints of one depth are turned at once, each quaternion component
     being a (joints of the level, frames) array. For 31 joints this is some fifty times faster on the CPU than
     one joint after the other, since the work is in long contiguous vectors, and the program that XLA sees
-    grows with the depth of the tree instead of its size.
+    grows with the depth of the tree instead of its size. The bind pose rides along as one more frame.
     """
-    local = jnp.moveaxis(jnp.asarray(motion.rotations), 0, -1)  # (joints, 4, frames)
-    offsets = jnp.asarray(skeleton.offsets)
+    frames = motion.root.shape[0]
+    rotations = jnp.asarray(motion.rotations)
+    offsets, rest = jnp.asarray(skeleton.offsets), jnp.asarray(skeleton.rest_rotations)
+    dtype = rotations.dtype
+    local = jnp.moveaxis(jnp.concatenate([rotations, rest[None].astype(dtype)]), 0, -1)  # (joints, 4, frames + 1)
+    root = jnp.concatenate([jnp.asarray(motion.root), offsets[:1]]).astype(dtype)
     levels = skeleton.levels
     # components of the level above: rotation 4 x (level, frames), position 3 x (level, frames)
     q = tuple(local[:1, i] for i in range(4))
-    p = tuple(jnp.asarray(motion.root)[:, i][None] for i in range(3))
+    p = tuple(root[:, i][None] for i in range(3))
     all_q, all_p = [jnp.stack(q, -1)], [jnp.stack(p, -1)]
     for above, level in zip(levels, levels[1:], strict=False):
         parent = np.array([above.index(skeleton.parents[j]) for j in level])
         joints = np.array(level)
         aw, ax, ay, az = (c[parent] for c in q)
         px, py, pz = (c[parent] for c in p)
-        if motion.translations is None:
-            vx, vy, vz = (offsets[joints, i][:, None] for i in range(3))
-        else:
-            vx, vy, vz = (jnp.asarray(motion.translations)[:, joints, i].T for i in range(3))
+        vx, vy, vz = (offsets[joints, i][:, None] for i in range(3))
+        if motion.translations is not None:
+            moving = jnp.asarray(motion.translations)[:, joints]
+            vx, vy, vz = (jnp.concatenate([moving[..., i].T, offsets[joints, i][:, None]], axis=1) for i in range(3))
         bw, bx, by, bz = (local[joints, i] for i in range(4))
         q = (
             aw * bw - ax * bx - ay * by - az * bz,
@@ -137,22 +144,50 @@ def forward_kinematics(
         all_q.append(jnp.stack(q, -1))
         all_p.append(jnp.stack(p, -1))
     order = np.argsort(np.concatenate([np.array(level) for level in levels]))
-    frames = motion.root.shape[0]
+    positions = jnp.moveaxis(jnp.concatenate(all_p)[order], 0, 1)
+    turned = jnp.moveaxis(jnp.concatenate(all_q)[order], 0, 1)
+    skin_rotations = rotation.to_matrix(rotation.multiply(turned[:-1], rotation.conjugate(turned[-1:])))
     return Kinematics(
-        positions_world=jnp.moveaxis(jnp.concatenate(all_p)[order], 0, 1),
-        rotations_world=jnp.moveaxis(jnp.concatenate(all_q)[order], 0, 1),
-        rotations_parent=jnp.asarray(motion.rotations),
+        positions_world=positions[:-1],
+        rotations_world=turned[:-1],
+        rotations_parent=rotations,
+        skin_rotations=skin_rotations,
+        skin_translations=positions[:-1] - jnp.einsum("tjab,jb->tja", skin_rotations, positions[-1]),
         dt=jnp.asarray(motion.dt),
-        signals=jnp.zeros((frames, 0)) if signals is None else signals,
+        signals=jnp.zeros((frames, 0), dtype) if signals is None else signals,
     )
 
 
-def bind_kinematics(skeleton: Skeleton) -> tuple[Float[Array, "joints 3"], Float[Array, "joints 4"]]:
-    """World position [m] and rotation of every joint in the bind pose."""
-    kin = forward_kinematics(skeleton, rest_motion(skeleton))
-    return kin.positions_world[0], kin.rotations_world[0]
+def host_kinematics(motion: Motion) -> tuple[Float[np.ndarray, "frames joints 3"], Float[np.ndarray, "frames joints 4"]]:
+    """World positions [m] and rotations in double precision whatever JAX's mode is, without compiling anything:
+    for files, set-up and measures."""
+    skeleton, rotations = motion.skeleton, np.asarray(motion.rotations, float)
+    offsets = np.asarray(skeleton.offsets, float)
+    positions, world = np.empty((*rotations.shape[:2], 3)), np.empty_like(rotations)
+    turned: list[Rotation] = []
+    for joint, parent in enumerate(skeleton.parents):
+        turn = Rotation.from_quat(rotations[:, joint], scalar_first=True)
+        if parent < 0:
+            positions[:, joint] = np.asarray(motion.root, float)
+        else:
+            offset = offsets[joint] if motion.translations is None else np.asarray(motion.translations, float)[:, joint]
+            positions[:, joint] = positions[:, parent] + turned[parent].apply(offset)
+            turn = turned[parent] * turn
+        turned.append(turn)
+        world[:, joint] = turn.as_quat(scalar_first=True)
+    return positions, world
 
 
-def joint_angles(a: Motion, b: Motion) -> Float[Array, "frames joints"]:
-    """The angle [rad] between two motions of one skeleton, per frame and joint."""
-    return rotation.angle_between(jnp.asarray(a.rotations), jnp.asarray(b.rotations))
+def bind_pose(skeleton: Skeleton) -> tuple[Float[np.ndarray, "joints 3"], Float[np.ndarray, "joints 4"]]:
+    """World position [m] and rotation of every joint in the bind pose, on the host."""
+    positions, rotations = host_kinematics(rest_motion(skeleton))
+    return positions[0], rotations[0]
+
+
+def joint_angles(a: Motion, b: Motion) -> Float[np.ndarray, "frames joints"]:
+    """The angle [rad] between two motions of one skeleton, per frame and joint, in double precision."""
+    shape = a.rotations.shape[:2]
+    first, second = (
+        Rotation.from_quat(np.asarray(m.rotations, float).reshape(-1, 4), scalar_first=True) for m in (a, b)
+    )
+    return (first.inv() * second).magnitude().reshape(shape)

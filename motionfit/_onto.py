@@ -2,13 +2,12 @@
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
-from motionfit import rotation
-from motionfit._motion import Motion, bind_kinematics, forward_kinematics
+from motionfit._motion import Motion, bind_pose, host_kinematics
 from motionfit._skeleton import SIDES, Skeleton
 
-IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
-UP = np.array([0.0, 1.0, 0.0])
+UP, SIDE = np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])
 
 
 def onto(motion: Motion, skeleton: Skeleton) -> Motion:
@@ -30,38 +29,39 @@ def onto(motion: Motion, skeleton: Skeleton) -> Motion:
     source.require(*required)
     skeleton.require(*required)
 
-    clip_positions, clip_rest = (np.asarray(x, float) for x in bind_kinematics(source))
-    positions, bind = (np.asarray(x, float) for x in bind_kinematics(skeleton))
+    clip_positions, clip_rest = bind_pose(source)
+    positions, bind_quaternions = bind_pose(skeleton)
     # turn the character's bind pose to face the way that the clip's rest pose faces
-    heading = np.asarray(rotation.between(_facing(skeleton, positions), _facing(source, clip_positions)))
-    positions, bind = _turn(heading, positions), np.asarray(rotation.multiply(heading, bind))
+    heading = _between(_facing(skeleton, positions), _facing(source, clip_positions))
+    positions = heading.apply(positions)
+    bind = heading * Rotation.from_quat(bind_quaternions, scalar_first=True)
 
-    world = np.asarray(forward_kinematics(source, motion).rotations_world, float)
-    away = np.asarray(rotation.multiply(world, rotation.conjugate(clip_rest)))  # D, per clip joint
+    frames = motion.frame_count
+    world = host_kinematics(motion)[1]
+    rest = Rotation.from_quat(clip_rest, scalar_first=True)
+    away = [Rotation.from_quat(world[:, j], scalar_first=True) * rest[j].inv() for j in range(world.shape[1])]  # D
     align = _alignments(source, clip_positions, skeleton, positions)
     targets = _targets(source, skeleton, away)
 
-    frames = motion.frame_count
-    local = np.tile(np.asarray(skeleton.rest_rotations, float), (frames, 1, 1))
-    turned = np.empty((frames, len(skeleton.names), 4))
+    rest_local = Rotation.from_quat(np.asarray(skeleton.rest_rotations, float), scalar_first=True)
+    local = np.empty((frames, len(skeleton.names), 4))
+    turned: list[Rotation] = []
     for joint, parent in enumerate(skeleton.parents):
-        above = turned[:, parent] if parent >= 0 else np.tile(heading if joint not in targets else IDENTITY, (frames, 1))
+        above = turned[parent] if parent >= 0 else Rotation.identity(frames)
         if joint in targets:
-            laid = np.asarray(rotation.multiply(align.get(skeleton.nearest_role(joint), IDENTITY), bind[joint]))
-            turned[:, joint] = np.asarray(rotation.multiply(targets[joint], laid))
-            local[:, joint] = np.asarray(rotation.multiply(rotation.conjugate(above), turned[:, joint]))
+            laid = align.get(skeleton.nearest_role(joint), Rotation.identity()) * bind[joint]
+            turned.append(targets[joint] * laid)
+            local[:, joint] = (above.inv() * turned[joint]).as_quat(scalar_first=True)
         else:
-            turned[:, joint] = np.asarray(rotation.multiply(above, local[:, joint]))
-            if parent < 0:
-                local[:, joint] = turned[:, joint]
-    local /= np.linalg.norm(local, axis=-1, keepdims=True)
+            local[:, joint] = rest_local[joint].as_quat(scalar_first=True)
+            turned.append(above * rest_local[joint])
     return Motion(skeleton, _root_path(motion, clip_positions, skeleton, positions), local, motion.dt)
 
 
 def leg_length(skeleton: Skeleton, positions: Float[np.ndarray, "joints 3"] | None = None) -> float:
     """Mean length [m] of thigh and calf together."""
     if positions is None:
-        positions = np.asarray(bind_kinematics(skeleton)[0], float)
+        positions = bind_pose(skeleton)[0]
     total = 0.0
     for side in SIDES:
         thigh, calf, foot = (positions[skeleton.joint(f"{side}_{r}")] for r in ("thigh", "calf", "foot"))
@@ -69,8 +69,15 @@ def leg_length(skeleton: Skeleton, positions: Float[np.ndarray, "joints 3"] | No
     return float(total / 2)
 
 
-def _turn(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return np.asarray(rotation.rotate(np.broadcast_to(q, (*v.shape[:-1], 4)), v))
+def _between(a: np.ndarray, b: np.ndarray) -> Rotation:
+    """The smallest rotation that takes direction a to direction b."""
+    a, b = (v / max(float(np.linalg.norm(v)), 1e-12) for v in (a, b))
+    axis = np.cross(a, b)
+    sine, cosine = float(np.linalg.norm(axis)), float(a @ b)
+    if sine < 1e-12:
+        # the same direction, or the opposite one: then half a turn about the vertical, or about x for verticals
+        return Rotation.identity() if cosine > 0 else Rotation.from_rotvec(np.pi * (UP if abs(a[1]) < 0.9 else SIDE))
+    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine))
 
 
 def _facing(skeleton: Skeleton, positions: np.ndarray) -> np.ndarray:
@@ -91,9 +98,9 @@ def _bone(skeleton: Skeleton, positions: np.ndarray, role: str) -> np.ndarray | 
 
 def _alignments(
     source: Skeleton, clip_positions: np.ndarray, skeleton: Skeleton, positions: np.ndarray
-) -> dict[str | None, np.ndarray]:
+) -> dict[str | None, Rotation]:
     """A per role: lays the character's bind bone along the clip's rest bone."""
-    align: dict[str | None, np.ndarray] = {}
+    align: dict[str | None, Rotation] = {}
     for side in SIDES:
         for kind, heir in (
             ("upper_arm", None), ("forearm", "hand"), ("thigh", None), ("calf", None), ("foot", "toe")
@@ -104,18 +111,18 @@ def _alignments(
                 continue
             if kind == "foot":
                 mine, theirs = (v * np.array([1.0, 0.0, 1.0]) for v in (mine, theirs))
-            align[role] = np.asarray(rotation.between(mine, theirs))
+            align[role] = _between(mine, theirs)
             if heir:
                 align[f"{side}_{heir}"] = align[role]
     return align
 
 
-def _targets(source: Skeleton, skeleton: Skeleton, away: np.ndarray) -> dict[int, np.ndarray]:
-    """Joint of the character -> how it turns away from rest in the world, (frames, 4)."""
-    targets: dict[int, np.ndarray] = {}
+def _targets(source: Skeleton, skeleton: Skeleton, away: list[Rotation]) -> dict[int, Rotation]:
+    """Joint of the character -> how it turns away from rest in the world, frame by frame."""
+    targets: dict[int, Rotation] = {}
     for role, joint in skeleton.roles:
         if (match := source.find(role)) is not None and not role.startswith(("spine_", "neck_")):
-            targets[joint] = away[:, match]
+            targets[joint] = away[match]
     for kind in ("spine", "neck"):
         mine, theirs = skeleton.chain(kind), source.chain(kind)
         for k, joint in enumerate(mine):
@@ -124,15 +131,15 @@ def _targets(source: Skeleton, skeleton: Skeleton, away: np.ndarray) -> dict[int
             # chains of different length share their turn evenly; their tops agree
             place = (k + 1) / len(mine) * len(theirs) - 1
             below, share = int(np.floor(max(place, 0.0))), max(place, 0.0) % 1
-            low, high = away[:, theirs[below]], away[:, theirs[min(below + 1, len(theirs) - 1)]]
-            targets[joint] = low if share == 0 else np.asarray(rotation.slerp(low, high, np.full(len(low), share)))
+            low, high = away[theirs[below]], away[theirs[min(below + 1, len(theirs) - 1)]]
+            targets[joint] = low * Rotation.from_rotvec(share * (low.inv() * high).as_rotvec())
     known = set(targets)
     names = {name.casefold(): j for j, name in enumerate(source.names)}
     for joint, name in enumerate(skeleton.names):
         # fingers and other joints without a role that both have; they follow the alignment of their limb
         match = names.get(name.casefold())
         if joint not in known and match is not None and match not in source.role_of_joint and skeleton.parents[joint] >= 0:
-            targets[joint] = away[:, match]
+            targets[joint] = away[match]
     return targets
 
 

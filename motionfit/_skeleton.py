@@ -153,8 +153,8 @@ class Skeleton(eqx.Module):
 
     `offsets` are joint positions in the parent's frame at bind [m]; that of the root is its bind position in the
     world. `rest_rotations` are the joint-to-parent rotations of the bind pose (the T-pose, for a clip that
-    brought one). `end_offsets` are the tips (BVH End Sites) in the frame of `end_parents`. `channels` keeps
-    what the file said about each joint, so that a round trip writes it again.
+    brought one). `end_offsets` are the tips (BVH End Sites) in the frame of `end_parents`. `channels` and
+    `file_unit` [m] keep what the file said about each joint and its lengths, so that a round trip writes it again.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -165,10 +165,11 @@ class Skeleton(eqx.Module):
     end_offsets: Float[AnyArray, "ends 3"]
     end_parents: tuple[int, ...] = eqx.field(static=True)
     channels: tuple[tuple[str, ...], ...] | None = eqx.field(static=True)
+    file_unit: float = eqx.field(static=True)
 
     def __init__(
         self, names, parents, offsets, rest_rotations=None, *, roles=None, end_parents=(), end_offsets=None,
-        channels=None,
+        channels=None, file_unit=1.0,
     ):  # fmt: skip
         """`roles` is a mapping role -> joint *name* that overrides what the names say."""
         self.names, self.parents = tuple(names), tuple(int(p) for p in parents)
@@ -186,7 +187,7 @@ class Skeleton(eqx.Module):
         self.rest_rotations = identity if rest_rotations is None else rest_rotations
         self.end_parents = tuple(int(p) for p in end_parents)
         self.end_offsets = np.zeros((0, 3)) if end_offsets is None else end_offsets
-        self.channels = channels
+        self.channels, self.file_unit = channels, float(file_unit)
         self.roles = tuple(sorted(recognise_roles(self.names, self.parents, roles).items()))
 
     def __check_init__(self):

@@ -9,8 +9,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from motionfit import rotation
-from motionfit._motion import Kinematics, bind_kinematics
-from motionfit._skeleton import Skeleton
+from motionfit._motion import Kinematics
 from motionfit._types import AnyArray, Faces, InputError, Vertices
 
 
@@ -70,18 +69,7 @@ def vertex_normals(vertices: Vertices, faces: Faces) -> Float[Array, "vertices 3
     return rotation.normalize(sums)
 
 
-def skinning_transforms(
-    skeleton: Skeleton, kin: Kinematics
-) -> tuple[Float[Array, "frames joints 3 3"], Float[Array, "frames joints 3"]]:
-    """M_j B_j^-1 of (4.20) as rotation matrices and translations [m]: bind pose to world, per frame and joint."""
-    bind_positions, bind_rotations = bind_kinematics(skeleton)
-    turns = rotation.multiply(kin.rotations_world, rotation.conjugate(bind_rotations))
-    matrices = rotation.to_matrix(turns)
-    return matrices, kin.positions_world - jnp.einsum("tjab,jb->tja", matrices, bind_positions)
-
-
 def skin_points(
-    skeleton: Skeleton,
     kin: Kinematics,
     points_bind: Float[AnyArray, "points 3"],
     joints: Int[AnyArray, "points influences"],
@@ -89,27 +77,26 @@ def skin_points(
 ) -> Float[Array, "frames points 3"]:
     """World positions [m] of points given in the bind pose, moved by (4.20): sum_j w_j M_j B_j^-1 v.
 
-    Transforms are blended per point before the point is applied, and the sum runs over the few influences of
-    each point only.
+    The sum runs over the few influences of each point only.
     """
-    matrices, translations = skinning_transforms(skeleton, kin)
     joints, weights, points = jnp.asarray(joints), jnp.asarray(weights), jnp.asarray(points_bind)
-    total = jnp.zeros((kin.positions_world.shape[0], *points.shape), points.dtype)
+    dtype = kin.skin_rotations.dtype
+    weights, points = weights.astype(dtype), points.astype(dtype)
+    total = jnp.zeros((kin.positions_world.shape[0], *points.shape), dtype)
     for k in range(joints.shape[1]):
-        moved = jnp.einsum("tpab,pb->tpa", matrices[:, joints[:, k]], points) + translations[:, joints[:, k]]
-        total = total + weights[:, k][:, None] * moved
+        moved = jnp.einsum("tpab,pb->tpa", kin.skin_rotations[:, joints[:, k]], points)
+        total = total + weights[:, k][:, None] * (moved + kin.skin_translations[:, joints[:, k]])
     return total
 
 
 def skin(
-    skeleton: Skeleton, mesh: Skin, kin: Kinematics
+    mesh: Skin, kin: Kinematics
 ) -> tuple[Float[Array, "frames vertices 3"], Float[Array, "frames vertices 3"]]:
     """World vertices [m] and unit normals of the whole skin in every frame: (4.20)."""
-    vertices = skin_points(skeleton, kin, mesh.vertices_bind, mesh.joints, mesh.weights)
-    matrices, _ = skinning_transforms(skeleton, kin)
+    vertices = skin_points(kin, mesh.vertices_bind, mesh.joints, mesh.weights)
     joints, weights, normals_bind = jnp.asarray(mesh.joints), jnp.asarray(mesh.weights), mesh.normals_bind
     normals = jnp.zeros_like(vertices)
     for k in range(joints.shape[1]):
-        turned = jnp.einsum("tpab,pb->tpa", matrices[:, joints[:, k]], normals_bind)
-        normals = normals + weights[:, k][:, None] * turned
+        turned = jnp.einsum("tpab,pb->tpa", kin.skin_rotations[:, joints[:, k]], normals_bind.astype(vertices.dtype))
+        normals = normals + weights[:, k][:, None].astype(vertices.dtype) * turned
     return vertices, rotation.normalize(normals)

@@ -8,13 +8,11 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from motionfit import rotation
 from motionfit._character import PARTS, Character
-from motionfit._motion import Motion, forward_kinematics, joint_angles
+from motionfit._motion import Motion, forward_kinematics, host_kinematics, joint_angles
 from motionfit._skinning import skin_points
 from motionfit._types import AnyArray
 from motionfit.shape.pairs import PAIRS, Pair
@@ -36,7 +34,7 @@ class SkinDepths(NamedTuple):
 
 @jax.jit
 def _posed_vertices(skeleton, motion, vertices, joints, weights):
-    return skin_points(skeleton, forward_kinematics(skeleton, motion), vertices, joints, weights)
+    return skin_points(forward_kinematics(skeleton, motion), vertices, joints, weights)
 
 
 def posed_vertices(character: Character, motion: Motion) -> Float[np.ndarray, "frames vertices 3"]:
@@ -164,7 +162,7 @@ def penetration_summary(
 
 def joint_angle_deviation(motion: Motion, source: Motion) -> tuple[float, float]:
     """Mean over frames and joints, and maximum, of the angle [rad] between each joint's rotation and the source's."""
-    angles = np.asarray(joint_angles(motion, source))
+    angles = joint_angles(motion, source)
     return float(angles.mean()), float(angles.max())
 
 
@@ -175,12 +173,12 @@ def forearm_direction(motion: Motion, source: Motion) -> float | None:
     sides = [(f, h) for f, h in sides if f is not None and h is not None]
     if not sides:
         return None
-    kins = [forward_kinematics(m.skeleton, m) for m in (motion, source)]
+    mine, theirs = host_kinematics(motion)[0], host_kinematics(source)[0]
     angles = []
     for forearm, hand in sides:
-        a, b = (rotation.normalize(k.positions_world[:, hand] - k.positions_world[:, forearm]) for k in kins)
-        angles.append(jnp.arctan2(rotation.safe_norm(jnp.cross(a, b)), jnp.sum(a * b, axis=-1)))
-    return float(jnp.mean(jnp.stack(angles)))
+        a, b = mine[:, hand] - mine[:, forearm], theirs[:, hand] - theirs[:, forearm]
+        angles.append(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1)))
+    return float(np.mean(angles))
 
 
 def root_path_ratio(motion: Motion, source: Motion) -> float | None:
@@ -204,29 +202,9 @@ def derivative_ratio(motion: Motion, source: Motion, order: int) -> float | None
     means = []
     for m in (motion, source):
         # float64: the third difference of float32 positions at 120 fps is mostly rounding
-        positions = _positions64(m)
+        positions = host_kinematics(m)[0]
         means.append(float(np.linalg.norm(np.diff(positions, order, axis=0), axis=-1).mean()))
     return means[0] / means[1] if means[1] > 1e-9 else None
-
-
-def _positions64(motion: Motion) -> Float[np.ndarray, "frames joints 3"]:
-    """Joint positions [m] in double precision whatever JAX's mode is, joint after joint in NumPy."""
-    from scipy.spatial.transform import Rotation
-
-    skeleton, rotations = motion.skeleton, np.asarray(motion.rotations, float)
-    offsets = np.asarray(skeleton.offsets, float)
-    world: list[Rotation] = []
-    positions = np.zeros((motion.frame_count, len(skeleton.names), 3))
-    for joint, parent in enumerate(skeleton.parents):
-        turn = Rotation.from_quat(rotations[:, joint], scalar_first=True)
-        if parent < 0:
-            positions[:, joint] = np.asarray(motion.root, float)
-            world.append(turn)
-            continue
-        offset = offsets[joint] if motion.translations is None else np.asarray(motion.translations, float)[:, joint]
-        positions[:, joint] = positions[:, parent] + world[parent].apply(offset)
-        world.append(world[parent] * turn)
-    return positions
 
 
 # --- the whole entry --------------------------------------------------------------------------------------------

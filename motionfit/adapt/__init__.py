@@ -1,6 +1,19 @@
-"""Recipes that build a Problem and fit it. `motionfit.adapt(...)` itself runs the whole procedure."""
+"""Recipes that build a Problem and fit it. The module can be called: `motionfit.adapt(...)` runs the whole procedure."""
+
+import sys
+import types
 
 from motionfit.adapt._clearance import OBJECTIVES, build_clearance, volume_depths
-from motionfit.adapt._pipeline import BLOCKS, adapt
+from motionfit.adapt._pipeline import BLOCKS, adapt, arms, legs
 
-__all__ = ["BLOCKS", "OBJECTIVES", "adapt", "build_clearance", "volume_depths"]
+__all__ = ["BLOCKS", "OBJECTIVES", "adapt", "arms", "build_clearance", "legs", "volume_depths"]
+
+
+class _CallableModule(types.ModuleType):
+    """`motionfit.adapt` is both the verb, mf.adapt(clip, body), and the folder of its recipes, mf.adapt.arms."""
+
+    def __call__(self, *args, **kwargs):
+        return adapt(*args, **kwargs)
+
+
+sys.modules[__name__].__class__ = _CallableModule

@@ -66,7 +66,7 @@ def _vertex(character: Character, pairs: tuple[Pair, ...]) -> Clearance:
     indices = tuple((probing.index(a), hit.index(b)) for _, a, b in directed)
     counted = tuple((bind_depths(sections[s], probes[p].points_bind) <= 0.0).astype(float) for p, s in indices)
     frames_free = np.zeros((1, len(indices)))
-    term = SkinClearance(character.skeleton, probes, sections, indices, counted, frames_free)
+    term = SkinClearance(probes, sections, indices, counted, frames_free)
     return Clearance(term, pairs, tuple(k for k, _, _ in directed))
 
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from motionfit import rotation
 from motionfit._character import Character
 from motionfit._control import Control, Drive
-from motionfit._motion import Motion, forward_kinematics
+from motionfit._motion import Motion, forward_kinematics, host_kinematics
 from motionfit._skeleton import SIDES
 from motionfit.adapt._clearance import Clearance
 from motionfit.splines import Basis
@@ -32,8 +32,7 @@ def arm_controls(
     contact too, and it is smoothed over 0.15 s.
     """
     skeleton = character.skeleton
-    kin = _kinematics(motion)
-    positions, world = np.asarray(kin.positions_world, float), np.asarray(kin.rotations_world, float)
+    positions, world = host_kinematics(motion)
     controls = []
     for side in SIDES:
         joint, elbow = skeleton.joint(f"{side}_upper_arm"), skeleton.joint(f"{side}_forearm")
@@ -58,8 +57,7 @@ def leg_controls(character: Character, motion: Motion, basis: Basis) -> tuple[Co
     apart.
     """
     skeleton = character.skeleton
-    kin = _kinematics(motion)
-    positions, world = np.asarray(kin.positions_world, float), np.asarray(kin.rotations_world, float)
+    positions, world = host_kinematics(motion)
     hips, left, right = (skeleton.joint(r) for r in ("hips", "left_thigh", "right_thigh"))
     up = np.tile(UP, (len(positions), 1))
     across = (positions[:, left] - positions[:, right]) * np.array([1.0, 0.0, 1.0])
@@ -89,11 +87,6 @@ def _world_axis_control(
             axis_world = above.inv().apply(axis_world)
         made.append(Drive(joint, jnp.asarray(axis_world), gain))
     return Control(name, tuple(made), basis, -bound, bound)
-
-
-@eqx.filter_jit
-def _kinematics(motion: Motion):
-    return forward_kinematics(motion.skeleton, motion)
 
 
 @eqx.filter_jit

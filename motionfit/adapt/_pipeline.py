@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from motionfit._character import Character
-from motionfit._control import Control, Correction
+from motionfit._control import Control
 from motionfit._fit import Block, Fit, fit
 from motionfit._motion import Motion
 from motionfit._onto import onto
@@ -15,7 +15,7 @@ from motionfit.adapt._clearance import Clearance, allowance, build_clearance, re
 from motionfit.adapt._controls import arm_controls, leg_controls
 from motionfit.metrics import TOLERANCE
 from motionfit.shape.growth import grow
-from motionfit.shape.pairs import PAIRS, Pair, pairs_of
+from motionfit.shape.pairs import Pair, pairs_of
 from motionfit.splines import bspline_basis
 from motionfit.terms.pose import Effort, Smoothness
 
@@ -97,4 +97,11 @@ def adapt(
     return Fit(result.correction, result.motion, base, status, result.history, problem, details)
 
 
-__all__ = ["BLOCKS", "PAIRS", "Correction", "adapt", "reference_depths"]
+def arms(clip: Motion, character: Character, **options) -> Fit:
+    """The arm block alone: thesis 4.4.1. Options as in `adapt`."""
+    return adapt(clip, character, blocks=("arms",), **options)
+
+
+def legs(clip: Motion, character: Character, **options) -> Fit:
+    """The leg block alone: thesis 4.5. Options as in `adapt`."""
+    return adapt(clip, character, blocks=("legs",), **options)

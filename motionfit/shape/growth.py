@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import coo_array
 
 from motionfit._character import PART_OF_ROLE, Character
-from motionfit._motion import bind_kinematics
+from motionfit._motion import bind_pose
 from motionfit._skeleton import SIDES, Skeleton
 from motionfit._skinning import Skin
 from motionfit._types import InputError
@@ -57,9 +57,9 @@ def grow(character: Character, girth: Mapping[str, float]) -> Character:
 
     vertices = np.asarray(skin.vertices_bind, float)
     joints, weights = np.asarray(skin.joints), np.asarray(skin.weights, float)
-    positions = np.asarray(bind_kinematics(skeleton)[0], float)
+    positions = bind_pose(skeleton)[0]
     grown = _grown_skeleton(skeleton, girth.get("trunk", 1.0))
-    new_positions = np.asarray(bind_kinematics(grown)[0], float)
+    new_positions = bind_pose(grown)[0]
     axes = _growth_axes(skeleton, positions)
     ring = _one_ring_mean(np.asarray(skin.faces), len(vertices))
 

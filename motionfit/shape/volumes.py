@@ -10,12 +10,12 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 from scipy.interpolate import BSpline
+from scipy.spatial.transform import Rotation
 
 from motionfit import rotation
 from motionfit._character import PARTS, Character
-from motionfit._motion import Kinematics, bind_kinematics
+from motionfit._motion import Kinematics, bind_pose
 from motionfit._skeleton import Skeleton
-from motionfit._skinning import skinning_transforms
 from motionfit._types import AnyArray, InputError
 
 # --- bones and the vertices that belong to them ----------------------------------------------------------------
@@ -27,7 +27,7 @@ def bone_tips(skeleton: Skeleton) -> Float[np.ndarray, "joints 3"]:
     The next joint of the limb where there is one, else the mean of the children, else the end site, else the
     joint itself.
     """
-    positions, rotations = (np.asarray(x, float) for x in bind_kinematics(skeleton))
+    positions, rotations = bind_pose(skeleton)
     limb = {"upper_arm": "forearm", "forearm": "hand", "thigh": "calf", "calf": "foot", "foot": "toe",
             "clavicle": "upper_arm"}  # fmt: skip
     spine, neck = skeleton.chain("spine"), skeleton.chain("neck")
@@ -47,7 +47,7 @@ def bone_tips(skeleton: Skeleton) -> Float[np.ndarray, "joints 3"]:
             tips[joint] = positions[list(children)].mean(0)
         elif ends:
             offset = np.asarray(skeleton.end_offsets, float)[ends].mean(0)
-            tips[joint] += np.asarray(rotation.rotate(rotations[joint], offset))
+            tips[joint] += Rotation.from_quat(rotations[joint], scalar_first=True).apply(offset)
     return tips
 
 
@@ -66,7 +66,7 @@ def allocate_vertices(character: Character) -> Int[np.ndarray, " vertices"]:
     two neighbours and not inside the bone itself: then the neighbour.
     """
     skeleton = character.skeleton
-    positions = np.asarray(bind_kinematics(skeleton)[0], float)
+    positions = bind_pose(skeleton)[0]
     tips = bone_tips(skeleton)
     vertices = np.asarray(character.skin.vertices_bind, float)
     master = character.skin.main_joint
@@ -136,7 +136,7 @@ def fit_volumes(character: Character, kind: str = "capsule") -> Volumes:
     skeleton = character.skeleton
     owner, areas = allocate_vertices(character), vertex_areas(character)
     vertices = np.asarray(character.skin.vertices_bind, float)
-    positions, rotations = (np.asarray(x, float) for x in bind_kinematics(skeleton))
+    positions, rotations = bind_pose(skeleton)
     tips = bone_tips(skeleton)
     of_role = {role: [j for j in range(len(positions)) if skeleton.nearest_role(j) == role] for role, _ in skeleton.roles}
     rows = []
@@ -161,8 +161,8 @@ def fit_volumes(character: Character, kind: str = "capsule") -> Volumes:
             if kind == "capsule":  # the half spheres must not stick out of the limb
                 inset = min(widths[0], half)
                 low, high = low + inset, high - inset
-        local = [np.asarray(rotation.rotate(rotation.conjugate(rotations[joint]), centre + s * axis - positions[joint]))
-                 for s in (low, high)]  # fmt: skip
+        to_joint = Rotation.from_quat(rotations[joint], scalar_first=True).inv()
+        local = [to_joint.apply(centre + s * axis - positions[joint]) for s in (low, high)]
         rows.append((role, joint, *local, widths, half))
     roles, joints, start, end, radii, half = zip(*rows, strict=True)
     return Volumes(kind, roles, joints, np.array(start), np.array(end), np.array(radii), np.array(half))
@@ -212,25 +212,23 @@ class Section(eqx.Module):
         fade = _smoothstep((h - low) / 0.03) * _smoothstep((high - h) / 0.03)
         return jnp.where(depth > 0, depth * fade, depth)
 
-    def to_bind(self, skeleton: Skeleton, kin: Kinematics, points_world: Float[Array, "frames points 3"]) -> Array:
+    def to_bind(self, kin: Kinematics, points_world: Float[Array, "frames points 3"]) -> Array:
         """World points taken into the bind pose of this part: (frames, points, 3)."""
-        matrices, translations = skinning_transforms(skeleton, kin)
-        moved = [
-            jnp.einsum("tba,tpb->tpa", matrices[:, j], points_world - translations[:, j][:, None]) for j in self.joints
-        ]
-        if len(moved) == 1:
-            return moved[0]
-        stacked = jnp.stack(moved, axis=-2)
-        point = jnp.mean(stacked, axis=-2)
+        chain = np.array(self.joints)
+        gap = points_world[:, :, None] - kin.skin_translations[:, None, chain]
+        moved = jnp.einsum("tjba,tpjb->tpja", kin.skin_rotations[:, chain], gap)
+        if len(chain) == 1:
+            return moved[:, :, 0]
+        point = jnp.mean(moved, axis=-2)
         for _ in range(2):  # the weights depend on the height that they help to find: two rounds settle it
             h = self._split(point)[2]
             weights = _height_basis(h, self.height_range, self.joint_weights.shape[0])[0] @ self.joint_weights
-            point = jnp.sum(weights[..., None] * stacked, axis=-2)
+            point = jnp.sum(weights[..., None] * moved, axis=-2)
         return point
 
-    def depth(self, skeleton: Skeleton, kin: Kinematics, points_world: Float[Array, "frames points 3"]) -> Array:
-        """Depth [m] of world points below the surface, (frames, points); negative outside."""
-        return self.depth_bind(self.to_bind(skeleton, kin, points_world))
+    def depth(self, kin: Kinematics, points_world: Float[Array, "frames points 3"]) -> Float[Array, "frames points"]:
+        """Depth [m] of world points below the surface; negative outside."""
+        return self.depth_bind(self.to_bind(kin, points_world))
 
     def _split(self, points):
         local = (points - jnp.asarray(self.origin_bind)) @ jnp.asarray(self.frame_bind).T
@@ -286,7 +284,7 @@ def fit_section(character: Character, part: str) -> Section:
         raise InputError(f"{character.name}: part {part!r} has {int(mine.sum())} vertices, too few to fit a volume; "
                          "check the skin weights and the role mapping")  # fmt: skip
     points, areas = vertices[mine], vertex_areas(character)[mine]
-    positions, tips = np.asarray(bind_kinematics(skeleton)[0], float), bone_tips(skeleton)
+    positions, tips = bind_pose(skeleton)[0], bone_tips(skeleton)
     if part == "torso":
         chain = (skeleton.joint("hips"), *skeleton.chain("spine"))
         axis = positions[chain[-1]] - positions[chain[0]]

@@ -14,7 +14,6 @@ from jaxtyping import Float
 from motionfit import rotation
 from motionfit._motion import Kinematics
 from motionfit._problem import Term
-from motionfit._skeleton import Skeleton
 from motionfit._skinning import skin_points
 from motionfit._types import AnyArray
 from motionfit.shape.distance import capsule_depth, cylinder_depth
@@ -86,29 +85,38 @@ class CapsuleClearance(Term):
 
 
 class SkinClearance(Term):
-    """Points of one part's skin against the generalised cylinder of another: one row per frame and pair.
+    """Points of parts' skin against the generalised cylinders of other parts: one row per frame and pair.
 
     The row is the Euclidean norm over the points of their excess depth, so its square is the sum over points.
-    `allowed` [m] is the depth that does not count, per frame and pair. `counted` masks, per pair, the probes that
-    lie inside the other part at bind already: those are the joint itself. `sigma` [m].
+    `pairs` name a set of `probes` and a section by their indices; `allowed` [m] is the depth that does not count,
+    per frame and pair. `counted` masks, per pair, the probes that lie inside the other part at bind already:
+    those are the joint itself. `sigma` [m].
     """
 
-    skeleton: Skeleton
     probes: tuple[Probes, ...]
     sections: tuple[Section, ...]
-    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)  # (index into probes, index into sections)
+    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
     counted: tuple[Float[AnyArray, " points"], ...]
-    allowed: Float[AnyArray, "frames pairs"]
+    allowed: Float[AnyArray, "*frames pairs"]
     sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.01)
     width: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.002)
 
     def point_depths(self, kin: Kinematics) -> list[Float[Array, "frames points"]]:
         """Depth [m] of every counted point per pair; points that do not count are far outside."""
-        points = [skin_points(self.skeleton, kin, p.points_bind, p.joints, p.weights) for p in self.probes]
-        depths = []
-        for (probe, section), counted in zip(self.pairs, self.counted, strict=True):
-            depth = self.sections[section].depth(self.skeleton, kin, points[probe])
-            depths.append(jnp.where(jnp.asarray(counted) > 0, depth, -1.0))
+        # all probes at once, and each section once over all the probes that meet it: the program stays small
+        joined = [jnp.concatenate([jnp.asarray(getattr(p, k)) for p in self.probes])
+                  for k in ("points_bind", "joints", "weights")]  # fmt: skip
+        ends = np.cumsum([len(p.points_bind) for p in self.probes])
+        points = jnp.split(skin_points(kin, *joined), ends[:-1], axis=1)
+        depths: list[Array] = [jnp.zeros(())] * len(self.pairs)
+        for k, section in enumerate(self.sections):
+            meeting = [i for i, pair in enumerate(self.pairs) if pair[1] == k]
+            met = [points[self.pairs[i][0]] for i in meeting]
+            split = np.cumsum([m.shape[1] for m in met])[:-1]
+            for i, depth in zip(
+                meeting, jnp.split(section.depth(kin, jnp.concatenate(met, axis=1)), split, axis=1), strict=True
+            ):
+                depths[i] = jnp.where(jnp.asarray(self.counted[i]) > 0, depth, -1.0)
         return depths
 
     def depth(self, kin: Kinematics) -> Float[Array, "frames pairs"]:

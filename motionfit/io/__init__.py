@@ -1,0 +1,151 @@
+"""Files in and out: metres, y up and quaternions wxyz on this side of the door."""
+
+import os
+import pathlib
+from collections.abc import Mapping
+
+import numpy as np
+
+from motionfit._character import Character
+from motionfit._motion import Motion, bind_pose, resample
+from motionfit._skeleton import load_role_mapping
+from motionfit._types import InputError
+from motionfit.io.bvh import parse_bvh, read_bvh, write_bvh
+from motionfit.io.npz import read_npz, write_npz
+
+CLIPS = (".bvh", ".glb", ".gltf", ".npz")
+CHARACTERS = (".glb", ".gltf")
+LATER = (".dae", ".amc", ".asf", ".c3d", ".fbx")
+
+Roles = Mapping[str, str] | str | os.PathLike | None
+
+
+def load_motion(
+    path: str | os.PathLike,
+    *,
+    unit: float | None = None,
+    up: str | None = None,
+    rest_frame: str = "auto",
+    roles: Roles = None,
+    start: float | None = None,
+    end: float | None = None,
+    fps: float | None = None,
+) -> Motion:
+    """Read a motion clip: .bvh, .glb, .gltf, or motionfit's own .npz; `builtin:walk` is the built-in sample.
+
+    `unit` [m per file unit] and `up` ("y", "z") override what a BVH seems to use; `rest_frame` says whether a
+    first frame in T-pose is motion ("auto", "first", "none"); `roles` is a mapping role -> joint name, or a JSON
+    file with one. `start`, `end` [s] cut the clip and `fps` [1/s] resamples it.
+    """
+    names = load_role_mapping(roles) if isinstance(roles, str | os.PathLike) else roles
+    if str(path).startswith("builtin:"):
+        motion = _builtin_clip(str(path))
+    else:
+        ending = _ending(path, CLIPS, "a motion clip")
+        if ending == ".bvh":
+            motion = read_bvh(path, unit=unit, up=up, rest_frame=rest_frame, roles=names)
+        elif ending == ".npz":
+            motion = read_npz(path)
+        else:
+            from motionfit.io.gltf import read_motion
+
+            motion = read_motion(path, rest_frame=rest_frame, roles=names)
+    return _cut(motion, path, start, end, fps)
+
+
+def _builtin_clip(name: str) -> Motion:
+    from motionfit.samples import CLIPS as SAMPLES
+
+    if name.removeprefix("builtin:") not in SAMPLES:
+        raise InputError(f"{name}: no such built-in clip; there are {', '.join('builtin:' + k for k in SAMPLES)}")
+    return SAMPLES[name.removeprefix("builtin:")]()
+
+
+def _cut(motion: Motion, path, start: float | None, end: float | None, fps: float | None) -> Motion:
+    duration = (motion.frame_count - 1) * float(motion.dt)
+    low, high = start or 0.0, duration if end is None else end
+    if not 0 <= low <= high or low > duration:
+        raise InputError(f"{path}: start {low:g} s and end {high:g} s do not lie in order within its {duration:.3f} s")
+    if start is not None or end is not None:
+        first, last = round(low / float(motion.dt)), round(min(high, duration) / float(motion.dt))
+        motion = motion[first : last + 1]
+    if fps is not None:
+        if not 1 <= fps <= 1000:
+            raise InputError(f"{path}: a frame rate from 1 to 1000 per second is allowed, got {fps:g}")
+        motion = resample(motion, fps)
+    return motion
+
+
+def load_character(path: str | os.PathLike, *, roles: Roles = None) -> Character:
+    """Read a skinned character: .glb or .gltf; `builtin:average`, `slim`, `heavy` or `child` is made on the spot."""
+    if str(path).startswith("builtin:"):
+        from motionfit.shape.bodies import builtin_body
+
+        return builtin_body(str(path).removeprefix("builtin:"))
+    _ending(path, CHARACTERS, "a character")
+    from motionfit.io.gltf import read_character
+
+    return read_character(path, roles=load_role_mapping(roles) if isinstance(roles, str | os.PathLike) else roles)
+
+
+def save(path: str | os.PathLike, motion: Motion, character: Character | None = None) -> None:
+    """Write a motion; the ending chooses the format. .glb and .gltf hold the skinned, animated character, .bvh and
+    .npz the motion. The file is complete or not there."""
+    ending = _ending(path, CLIPS, "an output")
+    if ending in (".glb", ".gltf"):
+        if character is None:
+            raise InputError(f"{path}: a {ending} holds a skinned character; call save(path, motion, character), "
+                             "or write .bvh or .npz")  # fmt: skip
+        from motionfit.io.gltf import write_gltf
+
+        write_gltf(path, motion, character)
+    elif ending == ".bvh":
+        write_bvh(path, motion)
+    else:
+        write_npz(path, motion)
+
+
+def _ending(path: str | os.PathLike, allowed: tuple[str, ...], what: str) -> str:
+    ending = pathlib.Path(path).suffix.lower()
+    if ending in allowed:
+        return ending
+    hint = "is not read yet; convert it to .glb or .bvh" if ending in LATER else f"is not {what}"
+    raise InputError(f"{path}: {ending or 'no ending'} {hint}; endings: {', '.join(allowed)}")
+
+
+def describe(path: str | os.PathLike) -> dict:
+    """What a file holds, as plain values: for `motionfit inspect`."""
+    found: dict = {"file": str(path)}
+    ending = pathlib.Path(path).suffix.lower()
+    skeleton = None
+    if ending in CHARACTERS or (str(path).startswith("builtin:") and not str(path).endswith(":walk")):
+        character = load_character(path)
+        skeleton, vertices = character.skeleton, np.asarray(character.skin.vertices_bind)
+        found |= {"kind": "character", "vertices": len(vertices), "triangles": len(character.skin.faces),
+                  "height_m": round(float(np.ptp(vertices[:, 1])), 4)}  # fmt: skip
+        try:
+            motion = load_motion(path)
+        except InputError:
+            motion = None
+    else:
+        motion = load_motion(path)
+        skeleton = motion.skeleton
+        found["kind"] = "motion"
+    if motion is not None:
+        rest = np.asarray(motion.skeleton.rest_rotations)
+        found |= {"frames": motion.frame_count, "frame_rate": round(motion.frame_rate, 4),
+                  "duration_s": round((motion.frame_count - 1) * float(motion.dt), 4)}  # fmt: skip
+        if ending == ".bvh":
+            in_file = len(parse_bvh(path).values)
+            found |= {
+                "unit_m": motion.skeleton.file_unit,
+                "up": "z" if abs(abs(rest[0, 0]) - 1) > 1e-3 and in_file == motion.frame_count else "y",
+                "rest_frame": "T-pose first frame, not taken for motion" if in_file > motion.frame_count else "none",
+            }
+    positions = bind_pose(skeleton)[0]
+    roles = {role: skeleton.names[joint] for role, joint in skeleton.roles}
+    without = [n for j, n in enumerate(skeleton.names) if j not in skeleton.role_of_joint]
+    found |= {"joints": len(skeleton.names), "end_sites": len(skeleton.end_parents),
+              "skeleton_height_m": round(float(np.ptp(positions[:, 1])), 4), "roles": roles,
+              "joints_without_role": without}  # fmt: skip
+    return found

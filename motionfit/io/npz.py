@@ -1,0 +1,58 @@
+"""motionfit's own lossless motion format: a NumPy archive with the skeleton and the motion."""
+
+import io
+import json
+import os
+import pathlib
+import zipfile
+
+import numpy as np
+
+from motionfit._motion import Motion
+from motionfit._skeleton import Skeleton
+from motionfit._types import InputError
+from motionfit.io.bvh import unreadable, write_bytes
+
+KEYS = ("motionfit_motion", "offsets", "rest_rotations", "end_offsets", "root", "rotations", "dt")
+
+
+def write_npz(path: str | os.PathLike, motion: Motion) -> None:
+    """Write a motion without loss: what is read back has the same bits."""
+    skeleton = motion.skeleton
+    described = {
+        "names": skeleton.names, "parents": skeleton.parents, "end_parents": skeleton.end_parents,
+        "channels": skeleton.channels, "file_unit": skeleton.file_unit,
+        "roles": {role: skeleton.names[joint] for role, joint in skeleton.roles},
+    }  # fmt: skip
+    arrays = {
+        "motionfit_motion": np.array(json.dumps(described)), "offsets": skeleton.offsets,
+        "rest_rotations": skeleton.rest_rotations, "end_offsets": skeleton.end_offsets,
+        "root": motion.root, "rotations": motion.rotations, "dt": motion.dt,
+    }  # fmt: skip
+    if motion.translations is not None:
+        arrays["translations"] = motion.translations
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **{k: np.asarray(v) for k, v in arrays.items()})
+    write_bytes(path, buffer.getvalue())
+
+
+def read_npz(path: str | os.PathLike) -> Motion:
+    """Read what `write_npz` wrote."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            arrays = {k: data[k] for k in data.files}
+    except OSError as error:
+        raise InputError(unreadable(path, error)) from None
+    except (ValueError, zipfile.BadZipFile, EOFError):
+        raise InputError(f"{pathlib.Path(path)}: not a readable .npz archive; it seems damaged") from None
+    missing = [k for k in KEYS if k not in arrays]
+    if missing:
+        raise InputError(f"{pathlib.Path(path)}: an .npz archive without {missing[0]!r}: not one that motionfit wrote; "
+                         "AMASS archives are not read yet")  # fmt: skip
+    d = json.loads(str(arrays["motionfit_motion"]))
+    channels = None if d["channels"] is None else tuple(tuple(c) for c in d["channels"])
+    skeleton = Skeleton(
+        d["names"], d["parents"], arrays["offsets"], arrays["rest_rotations"], roles=d["roles"],
+        end_parents=d["end_parents"], end_offsets=arrays["end_offsets"], channels=channels, file_unit=d["file_unit"],
+    )  # fmt: skip
+    return Motion(skeleton, arrays["root"], arrays["rotations"], arrays["dt"], arrays.get("translations"))

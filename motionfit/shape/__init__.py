@@ -1,0 +1,11 @@
+"""Body shape: volumes fitted to the skin, their distances, girth, and the built-in bodies."""
+
+from motionfit.shape.distance import capsule_depth, cylinder_depth, segment_distance
+from motionfit.shape.growth import grow, parse_girth
+from motionfit.shape.pairs import PAIRS, Pair
+from motionfit.shape.volumes import Probes, Section, Volumes, allocate_vertices, fit_section, fit_volumes, sample_probes
+
+__all__ = [
+    "PAIRS", "Pair", "Probes", "Section", "Volumes", "allocate_vertices", "capsule_depth", "cylinder_depth",
+    "fit_section", "fit_volumes", "grow", "parse_girth", "sample_probes", "segment_distance",
+]  # fmt: skip
