@@ -69,7 +69,7 @@ class Fit(eqx.Module):
     status: str = eqx.field(static=True)
     history: tuple[BlockReport, ...] = eqx.field(static=True)
     problem: Problem
-    details: dict = eqx.field(static=True, default_factory=dict)
+    details: dict = eqx.field(default_factory=dict)
 
     def report(self) -> dict:
         """The result as plain numbers, ready for JSON: status, and per block and term what moved."""
@@ -160,7 +160,6 @@ def _solve(problem: Problem, block: Block, points: tuple[Array, ...], free: tupl
     is_local = {k: isinstance(problem.terms[k], Term) and problem.terms[k].frame_local for k in terms}  # type: ignore
     start = tuple(points[k] for k in free)
     residual_terms = tuple(k for k in terms if isinstance(problem.terms[k], Term))
-    energies = tuple(k for k in terms if isinstance(problem.terms[k], Energy))
 
     def residuals(x, args):
         problem, fixed = args
@@ -171,10 +170,8 @@ def _solve(problem: Problem, block: Block, points: tuple[Array, ...], free: tupl
 
     def total(x, args):
         problem, fixed = args
-        cost = 0.5 * sum(jnp.sum(jnp.square(r)) for r in residuals(x, args))
-        signals = fixed.at[:, np.array(free)].set(_free_signals(problem, free, x))
-        kin = problem.kinematics(signals)
-        return cost + sum(problem.weights[k] * term_cost(problem.terms[k], kin) for k in energies)
+        kin = problem.kinematics(fixed.at[:, np.array(free)].set(_free_signals(problem, free, x)))
+        return sum(problem.weights[k] * term_cost(problem.terms[k], kin) for k in terms)
 
     solver = levenberg_marquardt() if block.solver is None else block.solver
     options = {"max_steps": block.max_steps, "throw": False, "adjoint": ADJOINT}
@@ -183,12 +180,8 @@ def _solve(problem: Problem, block: Block, points: tuple[Array, ...], free: tupl
         solution = optx.least_squares(residuals, solver, start, arguments, **options)
     else:
         solution = optx.minimise(total, solver, start, arguments, **options)
-    before, after = total(start, arguments), total(solution.value, arguments)
-    # the best iterate: a solver that broke down (NaN, a worse cost) must not make the motion worse
-    good = jnp.isfinite(after) & (after <= before)
-    value = jax.tree.map(lambda new, old: jnp.where(good, new, old), solution.value, start)
     steps = getattr(solution.state, "num_accepted_steps", solution.stats["num_steps"])
-    return value, before, jnp.where(good, after, before), steps, solution.result == optx.RESULTS.successful
+    return solution.value, steps, solution.result == optx.RESULTS.successful
 
 
 def fit(
@@ -209,24 +202,30 @@ def fit(
     for block in blocks:
         _check(block, problem, names)
     points = tuple(jnp.asarray(p) for p in (correction or Correction.zero(problem.controls)).points)
+    costs = problem.costs(Correction(problem.controls, points))
     history: list[BlockReport] = []
     for sweep in range(sweeps):
         for i, block in enumerate(blocks):
             started = time.perf_counter()
             free = tuple(names.index(c) for c in block.controls)
             terms = tuple(problem.terms) if block.terms is None else block.terms
-            before = problem.costs(Correction(problem.controls, points))
-            value, cost_before, cost_after, steps, converged = _solve(problem, block, points, free, terms)
+            before = costs
+            value, steps, converged = _solve(problem, block, points, free, terms)
             changed = list(points)
             for k, new in zip(free, value, strict=True):
                 changed[k] = new
-            points = tuple(changed)
-            after = problem.costs(Correction(problem.controls, points))
-            status = _status(float(cost_before), int(steps), bool(converged))
+            costs = problem.costs(Correction(problem.controls, tuple(changed)))
+            cost_before, cost_after = (sum(c[k] for k in terms) for c in (before, costs))
+            # the best iterate: a solver that broke down (NaN, a higher cost) must not make the motion worse
+            if cost_after <= cost_before:
+                points = tuple(changed)
+            else:
+                costs, cost_after = before, cost_before
+            status = _status(cost_before, cost_after, int(steps), bool(converged))
             history.append(
                 BlockReport(
-                    block.name, sweep, status, int(steps), float(cost_before), float(cost_after),
-                    {k: before[k] for k in terms}, {k: after[k] for k in terms}, time.perf_counter() - started,
+                    block.name, sweep, status, int(steps), cost_before, cost_after,
+                    {k: before[k] for k in terms}, {k: costs[k] for k in terms}, time.perf_counter() - started,
                 )
             )  # fmt: skip
             if progress is not None:
@@ -239,11 +238,11 @@ def fit(
     return Fit(result, result.apply(problem.motion), problem.motion, status, tuple(history), problem)
 
 
-def _status(cost_before: float, steps: int, converged: bool) -> str:
+def _status(cost_before: float, cost_after: float, steps: int, converged: bool) -> str:
     if cost_before == 0.0:
         return "nothing_to_do"
     # the first accepted step of an optimistix solver is its start
-    if steps <= 1:
+    if steps <= 1 or (cost_after == cost_before and not converged):
         return "no_progress"
     return "converged" if converged else "max_steps"
 

@@ -15,6 +15,7 @@ from motionfit._motion import Motion, forward_kinematics, host_kinematics
 from motionfit._skeleton import SIDES
 from motionfit.adapt._clearance import Clearance
 from motionfit.splines import Basis
+from motionfit.terms.penetration import SkinClearance
 
 UP = np.array([0.0, 1.0, 0.0])
 
@@ -33,15 +34,15 @@ def arm_controls(
     """
     skeleton = character.skeleton
     positions, world = host_kinematics(motion)
+    shoulders = tuple(skeleton.joint(f"{side}_upper_arm") for side in SIDES)
+    gradients = np.asarray(_depth_gradient(clearance, motion, jnp.asarray(allowed), shoulders), float)
     controls = []
-    for side in SIDES:
-        joint, elbow = skeleton.joint(f"{side}_upper_arm"), skeleton.joint(f"{side}_forearm")
-        rows = np.array([clearance.pairs[p].first.startswith(side) for p in clearance.pair_of_row])
-        gradient = np.asarray(_depth_gradient(clearance, motion, jnp.asarray(allowed), jnp.asarray(rows), joint), float)
+    for k, (side, joint) in enumerate(zip(SIDES, shoulders, strict=True)):
+        elbow = skeleton.joint(f"{side}_forearm")
         upper_arm = _unit(positions[:, elbow] - positions[:, joint])
         # where the arm is far from everything the gradient says little: lead the elbow away from the spine line
         outward = np.cross(upper_arm, _away_from_trunk(skeleton, positions, elbow))
-        axis = -gradient + 1e-3 * outward
+        axis = -gradients[:, k] + 1e-3 * outward
         axis -= (axis * upper_arm).sum(-1, keepdims=True) * upper_arm
         axis = gaussian_filter1d(_unit(axis), 0.15 / float(motion.dt), axis=0, mode="nearest")
         axis -= (axis * upper_arm).sum(-1, keepdims=True) * upper_arm
@@ -90,29 +91,34 @@ def _world_axis_control(
 
 
 @eqx.filter_jit
-def _depth_gradient(clearance: Clearance, motion: Motion, allowed, rows, joint: int):
-    """d (soft maximum of the excess over the rows) / d (world rotation vector of a joint), (frames, 3)."""
+def _depth_gradient(clearance: Clearance, motion: Motion, allowed, joints: tuple[int, ...]):
+    """d (soft maximum of the excess) / d (world rotation vector of each joint), (frames, joints, 3).
+
+    The rows that move with one joint do not move with the others, so one gradient serves all of them.
+    """
     skeleton = motion.skeleton
     base = forward_kinematics(skeleton, motion)
-    parent = skeleton.parents[joint]
+    above = base.rotations_world[:, np.array([skeleton.parents[j] for j in joints])]
     softness = 0.02  # [m]
 
     def total(turn):
-        above = base.rotations_world[:, parent]
         local = rotation.rotate(rotation.conjugate(above), turn)
-        turned = rotation.multiply(rotation.exp(local), motion.rotations[:, joint])
-        moved = Motion(skeleton, motion.root, jnp.asarray(motion.rotations).at[:, joint].set(turned), motion.dt)
-        kin = forward_kinematics(skeleton, moved)
-        if hasattr(clearance.term, "point_depths"):
-            depths = [
-                jnp.where(rows[k], d - allowed[:, k, None], -1.0) for k, d in enumerate(clearance.term.point_depths(kin))
-            ]
-            excess = jnp.concatenate(depths, axis=1)
-        else:
-            excess = jnp.where(rows, clearance.row_depths(kin) - allowed, -1.0)
-        return jnp.sum(softness * jax.nn.logsumexp(excess / softness, axis=1))
+        turned = rotation.multiply(rotation.exp(local), jnp.asarray(motion.rotations)[:, np.array(joints)])
+        rotations = jnp.asarray(motion.rotations).at[:, np.array(joints)].set(turned)
+        kin = forward_kinematics(skeleton, Motion(skeleton, motion.root, rotations, motion.dt))
+        cost = 0.0
+        for joint in joints:
+            side = skeleton.role_of_joint[joint].partition("_")[0]
+            rows = [k for k, p in enumerate(clearance.pair_of_row) if clearance.pairs[p].first.startswith(side)]
+            if isinstance(clearance.term, SkinClearance):
+                depths = clearance.term.point_depths(kin)
+                excess = jnp.concatenate([depths[k] - allowed[:, k, None] for k in rows], axis=1)
+            else:
+                excess = (clearance.row_depths(kin) - allowed)[:, np.array(rows)]
+            cost = cost + jnp.sum(softness * jax.nn.logsumexp(excess / softness, axis=1))
+        return cost
 
-    return jax.grad(total)(jnp.zeros((motion.root.shape[0], 3)))
+    return jax.grad(total)(jnp.zeros((motion.root.shape[0], len(joints), 3), base.positions_world.dtype))
 
 
 def _away_from_trunk(skeleton, positions: np.ndarray, joint: int) -> np.ndarray:

@@ -5,6 +5,7 @@ and the radius is the length that a surface sample of the volume would show, not
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -171,6 +172,7 @@ def fit_volumes(character: Character, kind: str = "capsule") -> Volumes:
 # --- generalised cylinders --------------------------------------------------------------------------------------
 
 HARMONICS = 6
+BLEND_KNOTS = 8
 
 
 class Section(eqx.Module):
@@ -179,7 +181,8 @@ class Section(eqx.Module):
     It lives in the bind pose. A world point is first taken there, through the joints of `joints` blended by
     `joint_weights` as a function of height, so that a bent trunk is followed. Then its radius about the centre
     line is compared with r(height, angle) = sum_k a_k(height) cos(k angle) + b_k(height) sin(k angle), the
-    coefficients being cubic B-splines of the height.
+    coefficients being cubic B-splines of the height. Where the surface is inclined against the radial direction
+    the distance is shorter than the difference of the radii: `scales` holds that factor in the same form.
     """
 
     part: str = eqx.field(static=True)
@@ -187,30 +190,14 @@ class Section(eqx.Module):
     origin_bind: Float[AnyArray, "3"]
     frame_bind: Float[AnyArray, "3 3"]  # rows: two directions across, the axis
     height_range: Float[AnyArray, "2"]
-    joint_weights: Float[AnyArray, "knots blended"]
+    joint_weights: Float[AnyArray, "blend_knots blended"]
     centres: Float[AnyArray, "knots 2"]
     radii: Float[AnyArray, "knots harmonics"]
+    scales: Float[AnyArray, "knots harmonics"]
 
     def depth_bind(self, points: Float[Array, "... 3"]) -> Float[Array, "..."]:
         """Depth [m] of bind-pose points below the surface (negative outside, roughly the distance)."""
-        x, y, h = self._split(points)
-        basis, slope = _height_basis(h, self.height_range, self.radii.shape[0])
-        centre = basis @ self.centres
-        x, y = x - centre[..., 0], y - centre[..., 1]
-        rho = rotation.safe_norm(jnp.stack([x, y], axis=-1))
-        safe = jnp.where(rho > 1e-6, rho, 1.0)
-        cosine, sine = jnp.where(rho > 1e-6, x / safe, 1.0), jnp.where(rho > 1e-6, y / safe, 0.0)
-        waves, turned = _fourier(cosine, sine)
-        coefficients = basis @ self.radii
-        radius = jnp.sum(coefficients * waves, axis=-1)
-        # the surface is inclined against the radial direction: the distance is that much shorter
-        around = jnp.sum(coefficients * turned, axis=-1) / jnp.maximum(radius, 0.02)
-        along = jnp.sum((slope @ self.radii) * waves, axis=-1)
-        depth = (radius - rho) / jnp.sqrt(1.0 + around**2 + along**2)
-        # the ends are open: they go on in the next segment. Fade out over 3 cm instead of ending in a wall
-        low, high = self.height_range[0], self.height_range[1]
-        fade = _smoothstep((h - low) / 0.03) * _smoothstep((high - h) / 0.03)
-        return jnp.where(depth > 0, depth * fade, depth)
+        return _section_depth(self._local(points), self.height_range, self.centres, self.radii, self.scales)
 
     def to_bind(self, kin: Kinematics, points_world: Float[Array, "frames points 3"]) -> Array:
         """World points taken into the bind pose of this part: (frames, points, 3)."""
@@ -221,8 +208,8 @@ class Section(eqx.Module):
             return moved[:, :, 0]
         point = jnp.mean(moved, axis=-2)
         for _ in range(2):  # the weights depend on the height that they help to find: two rounds settle it
-            h = self._split(point)[2]
-            weights = _height_basis(h, self.height_range, self.joint_weights.shape[0])[0] @ self.joint_weights
+            h = self._local(point)[..., 2]
+            weights = _height_basis(h, self.height_range, self.joint_weights.shape[0]) @ self.joint_weights
             point = jnp.sum(weights[..., None] * moved, axis=-2)
         return point
 
@@ -230,9 +217,26 @@ class Section(eqx.Module):
         """Depth [m] of world points below the surface; negative outside."""
         return self.depth_bind(self.to_bind(kin, points_world))
 
-    def _split(self, points):
-        local = (points - jnp.asarray(self.origin_bind)) @ jnp.asarray(self.frame_bind).T
-        return local[..., 0], local[..., 1], local[..., 2]
+    def _local(self, points):
+        return (points - jnp.asarray(self.origin_bind)) @ jnp.asarray(self.frame_bind).T
+
+
+@jax.jit
+def _section_depth(local, height_range, centres, radii, scales):
+    """Depth [m] of points given in a section's frame. Jitted by itself, so that sections share one trace."""
+    x, y, h = local[..., 0], local[..., 1], local[..., 2]
+    harmonics = radii.shape[1]
+    fields = _height_basis(h, height_range, radii.shape[0]) @ jnp.concatenate([radii, scales, centres], axis=1)
+    x, y = x - fields[..., -2], y - fields[..., -1]
+    rho = rotation.safe_norm(jnp.stack([x, y], axis=-1))
+    safe = jnp.where(rho > 1e-6, rho, 1.0)
+    waves = _fourier(jnp.where(rho > 1e-6, x / safe, 1.0), jnp.where(rho > 1e-6, y / safe, 0.0))
+    radius = jnp.sum(fields[..., :harmonics] * waves, axis=-1)
+    scale = jnp.sum(fields[..., harmonics : 2 * harmonics] * waves, axis=-1)
+    depth = (radius - rho) * scale
+    # the ends are open: they go on in the next segment. Fade out over 3 cm instead of ending in a wall
+    fade = _smoothstep((h - height_range[0]) / 0.03) * _smoothstep((height_range[1] - h) / 0.03)
+    return jnp.where(depth > 0, depth * fade, depth)
 
 
 def _smoothstep(x):
@@ -241,32 +245,27 @@ def _smoothstep(x):
 
 
 def _fourier(cosine, sine):
-    """1, cos, sin, cos 2a, sin 2a, ... and their derivatives by the angle, by the addition theorem."""
-    waves, turned = [jnp.ones_like(cosine)], [jnp.zeros_like(cosine)]
+    """1, cos a, sin a, cos 2a, sin 2a, ... by the addition theorem."""
+    waves = [jnp.ones_like(cosine)]
     c, s = cosine, sine
-    for k in range(1, HARMONICS + 1):
+    for _ in range(HARMONICS):
         waves += [c, s]
-        turned += [-k * s, k * c]
         c, s = c * cosine - s * sine, s * cosine + c * sine
-    return jnp.stack(waves, axis=-1), jnp.stack(turned, axis=-1)
+    return jnp.stack(waves, axis=-1)
 
 
 def _height_basis(h, height_range, count: int):
-    """Uniform cubic B-spline values and slopes [1/m] of `count` coefficients at heights h [m], clamped to the range.
+    """Uniform cubic B-splines: the values of `count` coefficients at heights h [m], clamped to the range.
 
     Written out densely, as a bump at each coefficient: it becomes a matrix product, where a gather of four
     neighbours would be slow to differentiate.
     """
-    low, high = height_range[0], height_range[1]
-    spans = count - 3
-    u = jnp.clip((h - low) / (high - low), 0.0, 1.0) * spans
-    inside = (h >= low) & (h <= high)
-    x = u[..., None] - (jnp.arange(count, dtype=u.dtype) - 1.0)
-    a = jnp.abs(x)
-    near, far = 2.0 / 3.0 - a**2 + a**3 / 2.0, jnp.clip(2.0 - a, 0.0, None) ** 3 / 6.0
-    values = jnp.where(a < 1, near, far)
-    slopes = jnp.where(a < 1, -2.0 * x + 1.5 * x * a, -jnp.sign(x) * jnp.clip(2.0 - a, 0.0, None) ** 2 / 2.0)
-    return values, slopes * (spans / (high - low)) * inside[..., None]
+    u = jnp.clip((h - height_range[0]) / (height_range[1] - height_range[0]), 0.0, 1.0) * (count - 3)
+    a = jnp.abs(u[..., None] - (jnp.arange(count, dtype=u.dtype) - 1.0))
+    far = jnp.maximum(2.0 - a, 0.0)
+    near = jnp.maximum(1.0 - a, 0.0)
+    # the cubic B-spline as a difference of truncated powers
+    return (far * far * far - 4.0 * near * near * near) / 6.0
 
 
 def fit_section(character: Character, part: str) -> Section:
@@ -299,7 +298,8 @@ def fit_section(character: Character, part: str) -> Section:
     frame = np.stack([first, np.cross(axis, first), axis])
     local = (points - origin) @ frame.T
     low, high = local[:, 2].min(), local[:, 2].max()
-    count = int(np.clip(round((high - low) / 0.035), 4, 20)) + 3
+    # the same for every body: corrections of different bodies then share one compiled program
+    count = (18 if part == "torso" else 11) + 3
     basis = _design(local[:, 2], low, high, count)
     bend = np.diff(np.eye(count), 2, axis=0)
 
@@ -319,6 +319,7 @@ def fit_section(character: Character, part: str) -> Section:
     design = (basis[:, :, None] * np.stack(waves, axis=1)[:, None, :]).reshape(len(points), -1)
     penalty = np.kron(1e-4 * bend.T @ bend, np.eye(len(order))) + np.kron(np.eye(count), np.diag(1e-6 * order**4 + 1e-9))
     radii = solve(design, rho, penalty).reshape(count, len(order))
+    scales = _inclination(radii, low, high)
 
     joints, weights = np.asarray(character.skin.joints)[mine], np.asarray(character.skin.weights, float)[mine]
     shares = np.stack([np.where(joints == j, weights, 0.0).sum(-1) for j in chain], axis=1)
@@ -330,9 +331,28 @@ def fit_section(character: Character, part: str) -> Section:
                 owner = skeleton.parents[owner]
             if owner != j and owner in chain and _is_trunk(skeleton, j):
                 shares[:, chain.index(owner)] += np.where(joints == j, weights, 0.0).sum(-1)
-    blend = np.clip(solve(basis, shares, smooth), 1e-4, None)
+    coarse = _design(local[:, 2], low, high, BLEND_KNOTS)
+    bend = np.diff(np.eye(BLEND_KNOTS), 2, axis=0)
+    blend = np.clip(solve(coarse, shares, 1e-4 * bend.T @ bend + 1e-9 * np.eye(BLEND_KNOTS)), 1e-4, None)
     blend /= blend.sum(-1, keepdims=True)
-    return Section(part, chain, origin, frame, np.array([low, high]), blend, centres, radii)
+    return Section(part, chain, origin, frame, np.array([low, high]), blend, centres, radii, scales)
+
+
+def _inclination(radii: np.ndarray, low: float, high: float) -> np.ndarray:
+    """1 / sqrt(1 + (dr/dangle / r)^2 + (dr/dheight)^2), the cosine of the surface's inclination, as coefficients."""
+    count, waves_count = radii.shape
+    heights = np.linspace(low, high, 4 * count)
+    angles = np.linspace(0.0, 2 * np.pi, 48, endpoint=False)
+    k = np.arange(1, HARMONICS + 1)
+    pairs = np.stack([np.cos(np.outer(angles, k)), np.sin(np.outer(angles, k))], axis=2).reshape(len(angles), -1)
+    waves = np.concatenate([np.ones((len(angles), 1)), pairs], axis=1)
+    basis = _design(heights, low, high, count)
+    radius = basis @ radii @ waves.T
+    along = np.gradient(radius, heights, axis=0)
+    around = (np.roll(radius, -1, 1) - np.roll(radius, 1, 1)) / (2 * (angles[1] - angles[0])) / np.maximum(radius, 0.02)
+    cosine = 1.0 / np.sqrt(1.0 + along**2 + around**2)
+    rows = np.linalg.lstsq(basis, cosine, rcond=None)[0] @ waves / len(angles)
+    return rows * np.r_[1.0, np.full(waves_count - 1, 2.0)]  # the discrete Fourier transform of the angles
 
 
 def _is_trunk(skeleton: Skeleton, joint: int) -> bool:

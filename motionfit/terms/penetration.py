@@ -5,7 +5,6 @@ body in the same frame (method: adjacent segments always overlap a little at the
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -134,4 +133,6 @@ class SkinClearance(Term):
 
 def bind_depths(section: Section, points_bind: Float[AnyArray, "points 3"]) -> Float[np.ndarray, " points"]:
     """Depth [m] of bind-pose points in a section: which probes are part of the joint itself."""
-    return np.asarray(jax.jit(lambda s, p: s.depth_bind(p))(section, jnp.asarray(points_bind)))
+    padded = np.zeros((-(-len(points_bind) // 64) * 64, 3))  # whole chunks, so that it compiles once
+    padded[: len(points_bind)] = points_bind
+    return np.asarray(section.depth_bind(jnp.asarray(padded)))[: len(points_bind)]
