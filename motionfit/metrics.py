@@ -211,7 +211,6 @@ def derivative_ratio(motion: Motion, source: Motion, order: int) -> float | None
 
 
 def measure(
-    character: Character,
     motion: Motion,
     source: Motion,
     *,
@@ -225,7 +224,6 @@ def measure(
     `volume_excess` [m] per frame and pair comes from `motionfit.adapt.volume_depths`, `skin` and `reference` from
     `skin_depths`. Feet and balance are null: they are measured by the parts of motionfit that treat them.
     """
-    del character
     penetration: dict = {"excess_max_m": None, "excess_mean_m": None, "frames_over_1cm": None, "pairs": {}}
     if volume_excess is not None:
         penetration = penetration_summary(np.asarray(volume_excess), pairs)

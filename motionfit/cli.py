@@ -1,0 +1,292 @@
+"""The command line: demo, adapt, metrics, inspect.
+
+Bad input ends with one line on stderr and status 2; a violation that is left over the tolerance with status 3.
+"""
+
+import json
+import math
+import os
+import pathlib
+import sys
+import time
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False,
+                  help="Adapt motion clips to the shape of a character.")  # fmt: skip
+
+ClipArgument = Annotated[str, typer.Argument(help="clip: .bvh, .glb, .gltf, .npz, or builtin:walk")]
+CharacterArgument = Annotated[str, typer.Argument(help="character: .glb, .gltf, or builtin:average|slim|heavy|child")]
+
+
+@app.command()
+def demo(out: Annotated[pathlib.Path, typer.Option(help="folder for adapted.glb, report.json, report.png")] = pathlib.Path("demo")) -> None:
+    """Adapt the built-in walk to the built-in heavy body."""
+    from motionfit._types import InputError
+
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be made a folder ({error.strerror}); choose another --out") from None
+    run_adapt(
+        "builtin:walk", "builtin:heavy", reference="builtin:average", out=out / "adapted.glb",
+        report=out / "report.json", plot=out / "report.png",
+    )  # fmt: skip
+
+
+@app.command()
+def adapt(
+    clip: ClipArgument,
+    character: CharacterArgument,
+    out: Annotated[pathlib.Path, typer.Option("-o", "--out", help="output: .glb, .gltf, .bvh or .npz")],
+    girth: Annotated[str | None, typer.Option(help="PART=SCALE,… e.g. arms=1.3,trunk=1.5; one number grows all")] = None,
+    reference: Annotated[str | None, typer.Option(help="the body that the clip was made for")] = None,
+    blocks: Annotated[str, typer.Option(help="arms,legs in the order to run, or none")] = "arms,legs",
+    objective: Annotated[str, typer.Option(help="vertex, capsule or joint")] = "vertex",
+    fps: Annotated[float | None, typer.Option(help="resample the clip to this frame rate [1/s]")] = None,
+    start: Annotated[float | None, typer.Option(help="cut the clip from here [s]")] = None,
+    end: Annotated[float | None, typer.Option(help="cut the clip up to here [s]")] = None,
+    unit: Annotated[float | None, typer.Option(help="metres per unit of a BVH file, where the guess is wrong")] = None,
+    up: Annotated[str | None, typer.Option(help="up axis of a BVH file, y or z, where the guess is wrong")] = None,
+    roles: Annotated[pathlib.Path | None, typer.Option(help="JSON role mapping for unknown joint names")] = None,
+    report: Annotated[pathlib.Path | None, typer.Option(help="write report.json here")] = None,
+    plot: Annotated[pathlib.Path | None, typer.Option(help="write report.png here")] = None,
+) -> None:
+    """Adapt CLIP to the shape of CHARACTER."""
+    run_adapt(clip, character, girth=girth, reference=reference, blocks=blocks, objective=objective, fps=fps,
+              start=start, end=end, unit=unit, up=up, roles=roles, out=out, report=report, plot=plot)  # fmt: skip
+
+
+@app.command()
+def metrics(
+    clip: ClipArgument,
+    character: CharacterArgument,
+    reference_clip: Annotated[str | None, typer.Option(help="the source clip that fidelity is against")] = None,
+    reference: Annotated[str | None, typer.Option(help="the body that the clip was made for")] = None,
+    json_file: Annotated[pathlib.Path | None, typer.Option("--json", help="write the measures here")] = None,
+) -> None:
+    """Measure CLIP on CHARACTER: penetration on volumes and skin, fidelity, smoothness."""
+    import motionfit as mf
+    from motionfit._progress import progress_bar
+
+    body, motion = mf.load_character(character), mf.load_motion(clip)
+    source = motion if reference_clip is None else mf.load_motion(reference_clip)
+    other = None if reference is None else mf.load_character(reference)
+    with progress_bar() as progress:
+        measured = _measure_all(body, {"clip": mf.onto(motion, body.skeleton)}, mf.onto(source, body.skeleton),
+                                source, other, progress)["clip"]  # fmt: skip
+    if json_file is not None:
+        _write_json(json_file, measured)
+    _print_table({"measured": measured})
+
+
+@app.command()
+def inspect(file: Annotated[str, typer.Argument(help="a clip or a character")]) -> None:
+    """Say what FILE holds: format, joints, roles, frames, units."""
+    from motionfit.io import describe
+
+    found = describe(file)
+    roles = found.pop("roles")
+    for key, value in found.items():
+        text = ", ".join(value) if isinstance(value, list) else str(value)
+        typer.echo(f"{key:<20} {text}")
+    typer.echo(f"{'roles':<20} {', '.join(f'{r}={n}' for r, n in roles.items()) or 'none'}")
+
+
+# --- what the commands share ------------------------------------------------------------------------------------
+
+
+def run_adapt(
+    clip: str, character: str, *, out: pathlib.Path, girth: str | None = None, reference: str | None = None,
+    blocks: str = "arms,legs", objective: str = "vertex", fps: float | None = None, start: float | None = None,
+    end: float | None = None, unit: float | None = None, up: str | None = None, roles: pathlib.Path | None = None,
+    report: pathlib.Path | None = None, plot: pathlib.Path | None = None,
+) -> None:  # fmt: skip
+    """Load, adapt, measure and write; leaves with status 3 where a violation is left."""
+    import jax
+    import numpy as np
+
+    import motionfit as mf
+    from motionfit._progress import progress_bar
+    from motionfit._types import InputError
+    from motionfit.io import CLIPS, _ending
+    from motionfit.shape.growth import grow, parse_girth
+
+    _ending(out, CLIPS, "an output")
+    for target in (out, report, plot):
+        if target is not None and not target.parent.is_dir():
+            raise InputError(f"{target}: its folder does not exist; make it first: mkdir -p {target.parent}")
+    names = () if blocks.strip() == "none" else tuple(b.strip() for b in blocks.split(",") if b.strip())
+    scales = parse_girth(girth) if girth else {}
+    started = time.perf_counter()
+    motion = mf.load_motion(clip, unit=unit, up=up, roles=roles, start=start, end=end, fps=fps)
+    body = mf.load_character(character)
+    other = mf.load_character(reference) if reference else (body if scales else None)
+    if scales:
+        body = grow(body, scales)
+    base = mf.onto(motion, body.skeleton)
+    loaded = time.perf_counter() - started
+
+    with progress_bar() as progress:
+        compiled = _CompileClock()
+        began = time.perf_counter()
+        step = progress.task("adapting", None)
+        fit = mf.adapt(motion, body, reference=other, blocks=names, objective=objective,
+                       progress=lambda name, done, total: step(done, total)) if names else None  # fmt: skip
+        progress.done("adapting")
+        solve = time.perf_counter() - began
+        motions = {"before": base, "after": base if fit is None else fit.motion}
+        measured = _measure_all(body, motions, base, motion, other, progress)
+    mf.save(out, motions["after"], body)
+    excess = {k: m.pop("_excess") for k, m in measured.items()}
+    pairs = [p.name for p in mf.shape.PAIRS]
+    left = measured["after"]["penetration"]["frames_over_1cm"] > 0
+    status = ("violations_left" if left else "converged") if fit is None else fit.status
+    total = time.perf_counter() - started
+    data = {
+        "schema": 1, "motionfit": mf.__version__, "clip": clip, "character": character, "reference": reference,
+        "girth": scales, "objective": objective, "frames": base.frame_count, "frame_rate": base.frame_rate,
+        "joints": len(body.skeleton.names), "vertices": len(body.skin.vertices_bind),
+        "device": jax.devices()[0].platform, "dtype": str(np.asarray(jax.numpy.zeros(0)).dtype),
+        "time_s": {"load": loaded, "compile": compiled.seconds, "solve": max(solve - compiled.seconds, 0.0),
+                   "blocks": {} if fit is None else {b.name: b.time_s for b in fit.history}, "total": total},
+        "status": status, "blocks": [] if fit is None else fit.report()["blocks"], **measured,
+    }  # fmt: skip
+    if report is not None:
+        _write_json(report, data)
+    if plot is not None:
+        from motionfit.view import report_picture
+
+        report_picture(plot, body, base, motions["after"], excess["before"], excess["after"], pairs,
+                       f"{clip} on {body.name}: {status.replace('_', ' ')}")  # fmt: skip
+    _print_table(measured)
+    typer.echo(f"{status.replace('_', ' ')} in {total:.1f} s; wrote " + ", ".join(str(p) for p in (out, report, plot) if p))
+    if status != "converged" and names:
+        raise typer.Exit(3)
+
+
+class _CompileClock:
+    """Adds up what JAX reports of the time that it compiles."""
+
+    def __init__(self) -> None:
+        import jax.monitoring
+
+        self.seconds = 0.0
+        jax.monitoring.register_event_duration_secs_listener(self._listen)
+
+    def _listen(self, event: str, duration: float, **_) -> None:
+        if event.startswith("/jax/core/compile/"):
+            self.seconds += duration
+
+
+def _measure_all(body, motions: dict, source, clip, reference, progress) -> dict[str, dict]:
+    """An M of report.json per motion; `_excess` holds the excess depths on the volumes for the picture."""
+    import motionfit as mf
+    from motionfit.adapt import build_clearance, volume_depths
+    from motionfit.adapt._pipeline import reference_depths
+    from motionfit.metrics import measure, skin_depths
+
+    pairs = mf.shape.PAIRS
+    clearance = build_clearance(body, pairs)
+    limit = reference_depths(clip, body, reference, pairs, "vertex", clearance)
+    # about 30 looks per second at the skin: what a limb does between two of them is under a millimetre deep
+    some = next(iter(motions.values()))
+    step = max(1, round(some.frame_rate / 30))
+    own = None
+    if reference is not None:
+        own = skin_depths(reference, mf.onto(clip, reference.skeleton), step=step, progress=progress.task("reference skin"))
+    result = {}
+    for name, motion in motions.items():
+        excess = volume_depths(clearance, motion) - limit
+        same = next((k for k in result if motions[k] is motion), None)
+        if same is not None:
+            result[name] = json.loads(json.dumps({k: v for k, v in result[same].items() if k != "_excess"}))
+        else:
+            skin = skin_depths(body, motion, step=step, progress=progress.task(f"skin {name}"))
+            result[name] = measure(motion, source, volume_excess=excess, skin=skin, reference=own)
+        result[name]["_excess"] = excess
+    return result
+
+
+def _finite(value):
+    """JSON has no NaN: whatever is not finite becomes null."""
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items() if not k.startswith("_")}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
+
+
+def _write_json(path: pathlib.Path, data: dict) -> None:
+    from motionfit.io.bvh import write_text
+
+    write_text(path, json.dumps(_finite(data), indent=2, allow_nan=False) + "\n")
+
+
+def _print_table(columns: dict[str, dict]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(show_edge=False, pad_edge=False)
+    table.add_column("")
+    for name in columns:
+        table.add_column(name, justify="right")
+
+    def line(label: str, *path: str, scale: float = 1.0, form: str = "{:.1f}") -> None:
+        cells = []
+        for m in columns.values():
+            value = m
+            for key in path:
+                value = value.get(key) if isinstance(value, dict) else None
+            cells.append("-" if value is None else form.format(scale * value))
+        table.add_row(label, *cells)
+
+    line("deepest excess, volumes [cm]", "penetration", "excess_max_m", scale=100)
+    line("frames over 1 cm, volumes [%]", "penetration", "frames_over_1cm", scale=100)
+    line("deepest excess, skin [cm]", "penetration", "skin", "excess_max_m", scale=100)
+    line("frames over 1 cm, skin [%]", "penetration", "skin", "frames_over_1cm", scale=100)
+    line("skin inside other parts [%]", "penetration", "skin", "inside_ratio", scale=100, form="{:.2f}")
+    line("mean joint deviation [deg]", "fidelity", "joint_angle_mean_rad", scale=180 / math.pi, form="{:.2f}")
+    line("forearm direction [deg]", "fidelity", "forearm_direction_mean_rad", scale=180 / math.pi)
+    line("jerk ratio", "smoothness", "jerk_ratio", form="{:.3f}")
+    Console(width=100).print(table)
+
+
+def _compilation_cache() -> None:
+    """Keep compiled programs in the user's cache folder; JAX_COMPILATION_CACHE_DIR= (empty) turns it off."""
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    import jax
+
+    from motionfit.shape.bodies import cache_folder
+
+    try:
+        folder = cache_folder() / "xla"
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def main() -> None:
+    """Run the command line with its exit statuses."""
+    from motionfit._types import InputError
+
+    try:
+        _compilation_cache()
+        app()
+    except InputError as error:
+        sys.stderr.write(f"motionfit: {' '.join(str(error).split())}\n")
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        sys.stderr.write("motionfit: interrupted; nothing half-written is left\n")
+        raise SystemExit(130) from None
+
+
+if __name__ == "__main__":
+    main()
