@@ -1,8 +1,11 @@
 """`adapt`: a clip and a character in, an adapted clip out. Thesis 4.4 and 4.5, block after block."""
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from motionfit._character import Character
 from motionfit._control import Control
@@ -13,7 +16,7 @@ from motionfit._problem import Problem, Term
 from motionfit._types import InputError
 from motionfit.adapt._clearance import Clearance, allowance, build_clearance, rest_depths, volume_depths
 from motionfit.adapt._controls import arm_controls, leg_controls
-from motionfit.metrics import TOLERANCE
+from motionfit.metrics import TOLERANCE, skin_depths
 from motionfit.shape.growth import grow
 from motionfit.shape.pairs import Pair, pairs_of
 from motionfit.splines import bspline_basis
@@ -25,8 +28,13 @@ KNOT_SPACING = 0.1  # [s]
 ALLOWED_EXCESS = 0.003  # [m]
 MARGIN = 0.004  # [m]
 SIGMA_DEPTH = 0.01  # [m]
-SIGMA_EFFORT = {"left_arm": 1.0, "right_arm": 1.0, "hip_turn": 1.0, "thighs_apart": 1.0}  # [rad]
-SIGMA_BEND = 60.0  # [rad/s^2]
+SIGMA_EFFORT = {"left_arm": 1.0, "right_arm": 1.0, "hip_turn": 0.1, "thighs_apart": 1.0}  # [rad]
+SIGMA_BEND = 5.0  # [rad/s^2]
+SKIN_ROUNDS = 3
+SKIN_INTERVAL = 1 / 15  # [s] between two looks at the skin
+SKIN_TOLERANCE = 0.007  # [m] excess that stays as it is
+SKIN_AIM = 0.004  # [m]
+SKIN_GAIN = 1.3
 
 
 def reference_depths(
@@ -58,43 +66,94 @@ def adapt(
     Penetration counts as far as it exceeds what the same clip shows on `reference`, the body that it was made
     for; without one, on the character before `girth`, else in its rest pose.
 
+    With a reference, the skin itself is looked at after the solve, some times per second, and where it shows more
+    than a few millimetres the volumes are given that much less room, up to three times.
+
     The `Fit` holds the adapted motion, the correction, what each block did, and per pair and frame the excess
     depth [m] on the volumes before and after (`fit.details["excess_before_m"]`, `["excess_after_m"]`).
     """
     unknown = [b for b in blocks if b not in BLOCKS]
-    if unknown:
-        raise InputError(f"unknown block {', '.join(map(repr, unknown))}; blocks: {', '.join(BLOCKS)}")
+    if unknown or not blocks:
+        raise InputError(f"unknown block {', '.join(map(repr, unknown)) or 'list'}; blocks: {', '.join(BLOCKS)}")
     if girth:
         reference, character = reference or character, grow(character, girth)
     base = onto(clip, character.skeleton)
     pairs = pairs_of(*blocks)
-    controls: list[Control] = []
-    terms: dict[str, Term] = {}
-    made: list[Block] = []
-    limits, clearances = {}, {}
     basis = bspline_basis(base.frame_count, float(base.dt), KNOT_SPACING)
-    for block in blocks:
-        own = pairs_of(block)
-        clearance = build_clearance(character, own, objective)
-        limit = reference_depths(clip, character, reference, own, objective, clearance)
+    controls: list[Control] = []
+    made: list[Block] = []
+    recipes: list[_Recipe] = []
+    for name in blocks:
+        clearance = build_clearance(character, pairs_of(name), objective)
+        limit = reference_depths(clip, character, reference, clearance.pairs, objective, clearance)
         excess = volume_depths(clearance, base) - limit
-        allowed = (limit + allowance(excess, ALLOWED_EXCESS, MARGIN))[:, list(clearance.pair_of_row)]
-        new = (arm_controls(character, base, clearance, allowed, basis) if block == "arms"
+        recipe = _Recipe(name, clearance, limit, limit + allowance(excess, ALLOWED_EXCESS, MARGIN))
+        new = (arm_controls(character, base, clearance, recipe.allowed_rows, basis) if name == "arms"
                else leg_controls(character, base, basis))  # fmt: skip
         controls += new
-        terms[f"{block}_clearance"] = clearance.allowing(allowed)
-        limits[block], clearances[block] = limit, clearance
-        made.append(Block(block, tuple(c.name for c in new), (f"{block}_clearance", "effort", "smoothness")))
-    sigma = np.array([SIGMA_EFFORT[c.name] for c in controls])
-    terms |= {"effort": Effort(sigma), "smoothness": Smoothness(SIGMA_BEND)}
-    problem = Problem(character, base, terms, tuple(controls))
-    result = fit(problem, made, sweeps, progress=progress)
-    before = np.concatenate([volume_depths(clearances[b], base) - limits[b] for b in blocks], axis=1)
-    after = np.concatenate([volume_depths(clearances[b], result.motion) - limits[b] for b in blocks], axis=1)
-    left = float(np.maximum(after, 0).max(initial=0.0))
-    status = "violations_left" if left > TOLERANCE else "converged"
-    details = {"pairs": [p.name for p in pairs], "excess_before_m": before, "excess_after_m": after}
-    return Fit(result.correction, result.motion, base, status, result.history, problem, details)
+        recipes.append(recipe)
+        made.append(Block(name, tuple(c.name for c in new), (f"{name}_clearance", "effort", "smoothness")))
+    effort = Effort(np.array([SIGMA_EFFORT[c.name] for c in controls]))
+
+    def problem_of(recipes: list[_Recipe]) -> Problem:
+        terms: dict[str, Term] = {f"{r.name}_clearance": r.clearance.allowing(r.allowed_rows) for r in recipes}
+        return Problem(character, base, terms | {"effort": effort, "smoothness": Smoothness(SIGMA_BEND)}, tuple(controls))
+
+    rounds = 1 + (SKIN_ROUNDS if reference is not None and objective == "vertex" else 0)
+    total, history, correction, own = rounds * sweeps * len(made), [], None, None
+    for round_ in range(rounds):
+        problem = problem_of(recipes)
+        result = fit(problem, made, sweeps, correction=correction, progress=None if progress is None else (
+            lambda name, done, _, round_=round_: progress(name, round_ * sweeps * len(made) + done, total)))  # fmt: skip
+        history, correction = [*history, *result.history], result.correction
+        if round_ == rounds - 1:
+            break
+        # the volumes are a model: what the skin itself still shows is taken off what they may keep
+        step = max(1, round(SKIN_INTERVAL / float(base.dt)))
+        if own is None:
+            own = skin_depths(reference, onto(clip, reference.skeleton), pairs, step=step)
+        seen = skin_depths(character, result.motion, pairs, step=step)
+        excess = seen.depth - own.depth
+        if excess.max(initial=0.0) <= SKIN_TOLERANCE:
+            break
+        recipes = _tighten(recipes, pairs, seen.frames, excess, base.frame_count, float(base.dt))
+    before, after = (
+        np.concatenate([volume_depths(r.clearance, m) - r.limit for r in recipes], axis=1) for m in (base, result.motion)
+    )
+    status = "violations_left" if after.max(initial=0.0) > TOLERANCE else "converged"
+    details = {"pairs": [p.name for r in recipes for p in r.clearance.pairs],
+               "excess_before_m": before, "excess_after_m": after}  # fmt: skip
+    return Fit(correction, result.motion, base, status, tuple(history), problem, details)
+
+
+class _Recipe(NamedTuple):
+    """What a block works with: its clearance, the reference's depths, and the depths that may stay [m]."""
+
+    name: str
+    clearance: Clearance
+    limit: Float[np.ndarray, "frames pairs"]
+    allowed: Float[np.ndarray, "frames pairs"]
+
+    @property
+    def allowed_rows(self) -> Float[np.ndarray, "frames rows"]:
+        return self.allowed[:, list(self.clearance.pair_of_row)]
+
+
+def _tighten(
+    recipes: list[_Recipe], pairs: tuple[Pair, ...], seen: np.ndarray, excess: np.ndarray, frame_count: int, dt: float
+) -> list[_Recipe]:
+    """Less may stay where the skin shows more than its tolerance: per pair, around the frames that show it."""
+    over = np.where(excess > SKIN_TOLERANCE, excess - SKIN_AIM, 0.0)
+    frames = np.arange(frame_count)
+    more = np.stack([np.interp(frames, seen, column) for column in over.T], axis=1)
+    # wide enough for a spline to follow, and nowhere less than what the frame itself needs
+    width = max(1, round(0.1 / dt))
+    more = gaussian_filter1d(maximum_filter1d(more, 2 * width + 1, axis=0), width / 2, axis=0, mode="nearest")
+    tightened = []
+    for recipe in recipes:
+        columns = [pairs.index(p) for p in recipe.clearance.pairs]
+        tightened.append(recipe._replace(allowed=recipe.allowed - SKIN_GAIN * more[:, columns]))
+    return tightened
 
 
 def arms(clip: Motion, character: Character, **options) -> Fit:
