@@ -1,0 +1,46 @@
+"""Random skeletons and motions, and independent oracles."""
+
+import numpy as np
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from motionfit import Motion, Skeleton
+
+
+def random_motion(seed: int, joints: int, frames: int, rate: float = 60.0) -> Motion:
+    """A random tree with random rest pose and rotations."""
+    rng = np.random.default_rng(seed)
+    parents = [-1] + [int(rng.integers(0, j)) for j in range(1, joints)]
+
+    def turns(*shape):
+        flat = Rotation.random(int(np.prod(shape)), random_state=rng).as_quat(scalar_first=True)
+        return flat.reshape(*shape, 4)
+
+    skeleton = Skeleton([f"joint{j}" for j in range(joints)], parents, rng.normal(size=(joints, 3)), turns(joints))
+    return Motion(skeleton, rng.normal(size=(frames, 3)), turns(frames, joints), 1.0 / rate)
+
+
+# the arguments of `random_motion`: built in the test, since the type checks of construction use `random`
+motions = st.tuples(st.integers(0, 2**31), st.integers(1, 12), st.integers(1, 6))
+
+
+def matrices(motion: Motion, frame: int) -> np.ndarray:
+    """World matrices of all joints by 4x4 products: the oracle of forward kinematics."""
+    result = []
+    for j, parent in enumerate(motion.skeleton.parents):
+        local = np.eye(4)
+        local[:3, :3] = Rotation.from_quat(np.asarray(motion.rotations)[frame, j], scalar_first=True).as_matrix()
+        local[:3, 3] = np.asarray(motion.root)[frame] if parent < 0 else np.asarray(motion.skeleton.offsets)[j]
+        result.append(local if parent < 0 else result[parent] @ local)
+    return np.stack(result)
+
+
+def central_difference(fn, x: np.ndarray, step: float = 1e-6) -> np.ndarray:
+    """Gradient of a scalar function by central differences in double precision."""
+    gradient = np.zeros_like(x)
+    for i in np.ndindex(x.shape):
+        up, down = x.copy(), x.copy()
+        up[i] += step
+        down[i] -= step
+        gradient[i] = (float(fn(up)) - float(fn(down))) / (2 * step)
+    return gradient

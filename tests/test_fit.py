@@ -1,0 +1,130 @@
+"""The block driver: known minima, honest statuses, corrections that come back to the bit."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import motionfit as mf
+from motionfit._motion import rest_motion
+from motionfit.splines import bspline_basis
+
+
+@pytest.fixture(scope="module")
+def still(average):
+    return average, rest_motion(average.skeleton)[np.zeros(20, int)]
+
+
+def _control(character, motion, role, name=None, **bounds):
+    basis = bspline_basis(motion.frame_count, float(motion.dt), 0.1)
+    return mf.Control(name or role, (mf.Drive(character.skeleton.joint(role), np.array([0, 0, 1.0]), 1.0),), basis, **bounds)
+
+
+def test_basis_sums_to_one_and_reproduces_lines():
+    for frames, spacing in ((2, 0.1), (37, 0.05), (300, 0.2)):
+        basis = bspline_basis(frames, 1 / 60, spacing)
+        np.testing.assert_allclose(basis.values.sum(1), 1.0, atol=1e-12)
+        assert basis.first.max() + 3 < basis.count
+        line = basis(jnp.arange(basis.count, dtype=float))
+        np.testing.assert_allclose(np.diff(line, 2), 0.0, atol=1e-9)
+
+
+def test_least_squares_block_reaches_the_known_minimum(still):
+    character, motion = still
+    control = _control(character, motion, "left_upper_arm")
+    target = 0.3
+
+    def towards(kin, goal):
+        return (kin.signals - goal) / 0.1
+
+    problem = mf.Problem(character, motion, {"goal": mf.Custom(towards, target), "effort": mf.terms.Effort(0.1)}, (control,))
+    result = mf.fit(problem, (mf.Block("arm", ("left_upper_arm",)),))
+    # two equal parabolas: the middle
+    np.testing.assert_allclose(result.correction.signals(), target / 2, atol=1e-6)
+    assert result.history[0].status == "converged" and result.history[0].cost_after < result.history[0].cost_before
+
+
+def test_minimisers_and_energies_work_and_are_refused_to_least_squares(still):
+    character, motion = still
+    control = _control(character, motion, "left_upper_arm")
+    problem = mf.Problem(character, motion, {"style": mf.Energy(lambda kin, goal: jnp.sum((kin.signals - goal) ** 2), 0.2)}, (control,))
+    with pytest.raises(mf.InputError, match="BFGS"):
+        mf.fit(problem, (mf.Block("b", ("left_upper_arm",)),))
+    result = mf.fit(problem, (mf.Block("b", ("left_upper_arm",), solver=optx.BFGS(rtol=1e-6, atol=1e-8), max_steps=100),))
+    np.testing.assert_allclose(result.correction.signals(), 0.2, atol=1e-3)
+
+
+def test_bounds_clamp_control_points(still):
+    character, motion = still
+    control = _control(character, motion, "left_upper_arm", lower=-0.1, upper=0.1)
+    problem = mf.Problem(character, motion, {"goal": mf.Custom(lambda kin, g: (kin.signals - g) / 0.1, 0.5)}, (control,))
+    result = mf.fit(problem, (mf.Block("arm", ("left_upper_arm",)),))
+    assert float(result.correction.signals().max()) <= 0.1 + 1e-12
+
+
+def test_unknown_names_list_the_known_ones(still):
+    character, motion = still
+    control = _control(character, motion, "left_upper_arm")
+    problem = mf.Problem(character, motion, {"effort": mf.terms.Effort(1.0)}, (control,))
+    with pytest.raises(mf.InputError, match="controls: left_upper_arm"):
+        mf.fit(problem, (mf.Block("b", ("nose",)),))
+    with pytest.raises(mf.InputError, match="terms: effort"):
+        mf.fit(problem, (mf.Block("b", ("left_upper_arm",), terms=("joy",)),))
+
+
+def test_nothing_to_do_and_zero_correction_are_bit_for_bit(still):
+    character, motion = still
+    control = _control(character, motion, "left_upper_arm")
+    problem = mf.Problem(character, motion, {"effort": mf.terms.Effort(1.0)}, (control,))
+    result = mf.fit(problem, (mf.Block("b", ("left_upper_arm",)),))
+    assert result.history[0].status == "nothing_to_do"
+    assert np.array_equal(result.motion.rotations, motion.rotations)
+    traced = jax.jit(lambda m: mf.Correction.zero((control,)).apply(m).rotations)(motion)
+    assert np.array_equal(traced, motion.rotations)
+
+
+def test_frame_local_rule_gives_the_same_jacobian(still):
+    """The one product per control against plain forward mode."""
+    from motionfit._fit import _frame_local_rows, _Rows
+
+    character, motion = still
+    controls = tuple(_control(character, motion, r) for r in ("left_upper_arm", "left_forearm"))
+    hand = (character.skeleton.joint("left_hand"),)
+    problem = mf.Problem(character, motion, {"t": mf.terms.JointTracking(hand, np.zeros((20, 1, 3)))}, controls)
+    rows = _Rows(problem, jnp.zeros((20, 2)), (0, 1), ("t",))
+    signals = jnp.asarray(np.random.default_rng(1).normal(size=(20, 2)))
+    fast = jax.jacfwd(lambda s: _frame_local_rows(s, rows))(signals)
+    np.testing.assert_allclose(fast, jax.jacfwd(rows)(signals), atol=1e-9)
+
+
+def test_new_numbers_do_not_recompile(still):
+    character, motion = still
+    control = _control(character, motion, "left_upper_arm")
+    traces = []
+
+    def counting(kin, goal):
+        traces.append(1)
+        return (kin.signals - goal) / 0.1
+
+    for goal, weight in ((0.1, 1.0), (0.2, 2.0), (0.4, 0.5)):
+        problem = mf.Problem(character, motion, {"goal": mf.Custom(counting, goal)}, (control,), {"goal": weight})
+        mf.fit(problem, (mf.Block("arm", ("left_upper_arm",)),))
+        if goal == 0.1:
+            first = len(traces)
+    assert first > 0 and len(traces) == first
+
+
+def test_corrections_save_and_apply_to_the_same_bits(still, tmp_path):
+    character, motion = still
+    control = _control(character, motion, "left_upper_arm")
+    points = (jnp.asarray(np.random.default_rng(2).normal(size=control.basis.count)) * 0.2,)
+    correction = mf.Correction((control,), points)
+    correction.save(tmp_path / "c.npz")
+    again = mf.load_correction(tmp_path / "c.npz")
+    assert np.array_equal(again.apply(motion).rotations, correction.apply(motion).rotations)
+    assert np.array_equal(again["left_upper_arm"], correction["left_upper_arm"])
+    with pytest.raises(KeyError, match="left_upper_arm"):
+        again["nose"]
+    with pytest.raises(mf.InputError, match="20 frames"):
+        again.apply(motion[:5])

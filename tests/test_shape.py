@@ -1,0 +1,119 @@
+"""Volumes against closed forms, distances against dense sampling, girth growth."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+
+import motionfit as mf
+from motionfit._motion import bind_pose
+from motionfit.shape import grow, parse_girth
+from motionfit.shape.distance import capsule_depth, closest_on_lines, cylinder_depth, segment_distance
+from motionfit.shape.volumes import fit_section, fit_volumes
+
+
+@given(st.integers(0, 2**31), st.booleans())
+def test_segment_distance_is_the_least_over_dense_samples(seed, parallel):
+    rng = np.random.default_rng(seed)
+    p0, p1, q0, q1 = rng.normal(size=(4, 3))
+    if parallel:
+        q1 = q0 + rng.normal() * (p1 - p0)
+    distance, s, t = segment_distance(*(jnp.asarray(x) for x in (p0, p1, q0, q1)))
+    grid = np.linspace(0, 1, 201)
+    gaps = (p0 + grid[:, None] * (p1 - p0))[:, None] - (q0 + grid[:, None] * (q1 - q0))[None]
+    assert float(distance) <= np.linalg.norm(gaps, axis=-1).min() + 1e-9
+    reached = p0 + float(s) * (p1 - p0) - q0 - float(t) * (q1 - q0)
+    assert 0 <= s <= 1 and 0 <= t <= 1 and np.linalg.norm(reached) == pytest.approx(float(distance), abs=1e-9)
+
+
+def test_lines_follow_the_corrected_formula():
+    """The connecting vector is perpendicular to both lines; with the thesis's printed t it is not."""
+    rng = np.random.default_rng(0)
+    p0, u, q0, v = (jnp.asarray(x) for x in rng.normal(size=(4, 3)))
+    s, t = closest_on_lines(p0, u, q0, v)
+    w = p0 + s * u - q0 - t * v
+    assert abs(w @ u) < 1e-10 and abs(w @ v) < 1e-10
+
+
+def test_cylinder_and_capsule_depths_in_closed_form():
+    x, z = jnp.array([1.0, 0, 0]), jnp.array([0, 0, 1.0])
+    crossed = (-x, x, jnp.asarray(0.3), -z + jnp.array([0, 0.4, 0]), z + jnp.array([0, 0.4, 0]), jnp.asarray(0.2))
+    for rule in (capsule_depth, cylinder_depth):
+        assert float(rule(*crossed)) == pytest.approx(0.1)
+    # end to end: the capsule's half sphere reaches 0.2 further than the flat end
+    ends = (-x, x, jnp.asarray(0.2), x * 1.1 - z, x * 1.1 + z, jnp.asarray(0.05))
+    assert float(capsule_depth(*ends)) == pytest.approx(0.15)
+    assert float(cylinder_depth(*ends)) == pytest.approx(-0.05)
+
+
+def _tube(radius: float, length: float, sections: int = 64) -> mf.Character:
+    """A cylinder along y bound to a forearm on a person's arm joint names."""
+    mesh = trimesh.creation.cylinder(radius, length, sections=sections)
+    mesh = mesh.subdivide_to_size(0.05)
+    side = np.abs(mesh.face_normals[:, 2]) < 0.5
+    mesh.update_faces(side)
+    mesh.remove_unreferenced_vertices()
+    vertices = np.asarray(mesh.vertices)[:, [1, 2, 0]] + [0, 0, 0]
+    skeleton = mf.Skeleton(["LeftForeArm", "LeftHand"], [-1, 0], np.array([[0, -length / 2, 0], [0, length, 0.0]]))
+    joints = np.zeros((len(vertices), 1), np.int32)
+    return mf.Character(skeleton, mf.Skin(vertices, np.asarray(mesh.faces), joints, np.ones((len(vertices), 1))))
+
+
+def test_a_cylinder_is_found_as_one():
+    """Points on the side have variance r^2/2 across: the erratum of thesis (4.1)."""
+    body = _tube(0.06, 0.5)
+    volumes = fit_volumes(body, "cylinder")
+    assert volumes.radii[volumes.index("left_forearm")] == pytest.approx(0.06, rel=0.01)
+    capsule = fit_volumes(body, "capsule")
+    k = capsule.index("left_forearm")
+    assert np.linalg.norm(capsule.end[k] - capsule.start[k]) == pytest.approx(0.5 - 0.12, rel=0.02)
+
+
+def test_a_section_fits_the_skin_of_real_shapes(heavy):
+    for part, bound in (("torso", 0.012), ("left_thigh", 0.006), ("left_forearm", 0.004)):
+        section = fit_section(heavy, part)
+        mine = heavy.part_of_vertex == mf._character.PARTS.index(part)
+        depth = np.asarray(section.depth_bind(jnp.asarray(heavy.skin.vertices_bind[mine])))
+        assert np.sqrt(np.mean(depth**2)) < bound, part
+        outward = np.asarray(heavy.skin.normals_bind)[mine] * 0.03
+        outside = np.asarray(section.depth_bind(jnp.asarray(heavy.skin.vertices_bind[mine] + outward)))
+        assert np.mean(outside < 0) > 0.97, part
+
+
+def test_girth_of_one_changes_no_bit(average):
+    grown = grow(average, {"arms": 1.0, "legs": 1.0, "trunk": 1.0})
+    assert np.array_equal(grown.skin.vertices_bind, average.skin.vertices_bind)
+    assert np.array_equal(grown.skeleton.offsets, average.skeleton.offsets)
+
+
+def test_growth_scales_across_the_bone_and_only_there(average):
+    grown = grow(average, {"left_arm": 1.5})
+    moved = grown.skin.vertices_bind - average.skin.vertices_bind
+    positions = bind_pose(average.skeleton)[0]
+    elbow, wrist = (positions[average.skeleton.joint(f"left_{r}")] for r in ("forearm", "hand"))
+    axis = (wrist - elbow) / np.linalg.norm(wrist - elbow)
+    along = (average.skin.vertices_bind - elbow) @ axis
+    mine = average.part_of_vertex == mf._character.PARTS.index("left_forearm")
+    middle = mine & (along > 0.09) & (along < 0.15)
+    offset = average.skin.vertices_bind[middle] - elbow
+    across = offset - (offset @ axis)[:, None] * axis
+    np.testing.assert_allclose(moved[middle], 0.5 * across, atol=2e-3)
+    right = average.part_of_vertex == mf._character.PARTS.index("right_forearm")
+    assert np.abs(moved[right]).max() == 0.0
+
+
+def test_trunk_growth_moves_the_limbs_out(average):
+    grown = grow(average, {"trunk": 1.4})
+    for role in ("left_clavicle", "right_upper_arm", "left_thigh"):
+        joint = average.skeleton.joint(role)
+        np.testing.assert_allclose(grown.skeleton.offsets[joint], 1.4 * average.skeleton.offsets[joint])
+
+
+def test_girth_texts():
+    assert parse_girth("arms=1.3, trunk=1.5") == {"arms": 1.3, "trunk": 1.5}
+    assert parse_girth("1.6") == {"arms": 1.6, "legs": 1.6, "trunk": 1.6}
+    for wrong in ("arms", "arms=x", "", "=2"):
+        with pytest.raises(mf.InputError, match="arms=1.3"):
+            parse_girth(wrong)

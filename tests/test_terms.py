@@ -1,0 +1,104 @@
+"""One contract for every term: rows per frame, finite, and gradients that central differences confirm."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import motionfit as mf
+from motionfit import samples
+from motionfit._motion import rest_motion
+from motionfit.adapt import build_clearance
+from motionfit.shape.pairs import pairs_of
+from motionfit.splines import bspline_basis
+from motionfit.terms.penetration import hinge
+from tests.helpers import central_difference
+
+RELATIVE = 1e-4  # analytic against central differences in double precision
+
+
+def _problem(term, character, motion, joints=("left_upper_arm", "right_thigh", "left_forearm")):
+    basis = bspline_basis(motion.frame_count, float(motion.dt), 0.1)
+    axes = ([0.0, 0.0, 1.0], [0.3, 0.2, 0.9], [1.0, 0.0, 0.0])
+    controls = tuple(
+        mf.Control(role, (mf.Drive(character.skeleton.joint(role), np.array(axis) / np.linalg.norm(axis), 1.0),), basis)
+        for role, axis in zip(joints, axes, strict=True)
+    )
+    return mf.Problem(character, motion, {"term": term}, controls)
+
+
+def _terms(character, motion):
+    kin = mf.forward_kinematics(character.skeleton, motion)
+    frames = motion.frame_count
+    for objective in ("vertex", "capsule", "joint"):
+        for block in ("arms", "legs"):
+            clearance = build_clearance(character, pairs_of(block), objective)
+            # within a hair of first contact: half of the rows just touch, half just do not
+            depth = np.asarray(clearance.row_depths(kin))
+            touching = depth - 1e-4 * np.where(np.arange(depth.shape[1]) % 2 == 0, 1.0, -1.0)
+            yield f"{objective}-{block}-contact", clearance.allowing(touching)
+            yield f"{objective}-{block}-deep", clearance.allowing(np.full_like(depth, -0.05))
+    hand = (character.skeleton.joint("left_hand"),)
+    yield "joint-tracking", mf.terms.JointTracking(hand, np.zeros((frames, 1, 3)), 0.1)
+    yield "rotation-tracking", mf.terms.RotationTracking(hand, np.asarray(kin.rotations_world[:, hand]), 0.1)
+    yield "effort", mf.terms.Effort(np.array([0.5, 1.0, 2.0]))
+    yield "smoothness", mf.terms.Smoothness(5.0)
+    yield "robust", mf.Robust(mf.terms.Effort(0.01), 2.0)
+    yield "during", mf.During(mf.terms.Smoothness(5.0), np.linspace(0, 1, frames))
+    yield "custom", mf.Custom(_level, 0.9)
+
+
+def _level(kin, height):
+    return (kin.positions_world[:, 0, 1] - height) / 0.05 + kin.positions_world[:, 20, 0] ** 2
+
+
+NAMES = [f"{o}-{b}-{k}" for o in ("vertex", "capsule", "joint") for b in ("arms", "legs") for k in ("contact", "deep")]
+NAMES += ["joint-tracking", "rotation-tracking", "effort", "smoothness", "robust", "during", "custom"]
+
+
+@pytest.fixture(scope="module")
+def cases(heavy):
+    motion = mf.onto(samples.walk(cycles=1), heavy.skeleton)[:6]
+    still = rest_motion(heavy.skeleton)[np.zeros(6, int)]  # degenerate: bind pose, all limbs straight, at rest
+    return {kind: (m, dict(_terms(heavy, m))) for kind, m in (("walk", motion), ("bind", still))}
+
+
+@pytest.mark.parametrize("pose", ["walk", "bind"])
+@pytest.mark.parametrize("name", NAMES)
+def test_contract(cases, heavy, name, pose):
+    motion, terms = cases[pose]
+    problem = _problem(terms[name], heavy, motion)
+    sizes = [c.basis.count for c in problem.controls]
+    rng = np.random.default_rng(3)
+    start = rng.normal(size=sum(sizes)) * 0.003
+
+    def cost(x):
+        parts = jnp.split(jnp.asarray(x), np.cumsum(sizes)[:-1])
+        signals = jnp.stack([c.signal(p) for c, p in zip(problem.controls, parts, strict=True)], axis=1)
+        return 0.5 * jnp.sum(problem.terms["term"].residual(problem.kinematics(signals)) ** 2)
+
+    rows = problem.terms["term"].residual(problem.kinematics(jnp.zeros((motion.frame_count, 3))))
+    assert rows.shape[0] == motion.frame_count and np.isfinite(rows).all()
+    cost = jax.jit(cost)
+    for x in (np.zeros_like(start), start):
+        gradient = np.asarray(jax.grad(cost)(x))
+        expected = central_difference(cost, x)
+        assert np.isfinite(gradient).all()
+        scale = max(np.abs(expected).max(), 1e-6)
+        np.testing.assert_allclose(gradient, expected, atol=RELATIVE * scale + 1e-7)
+
+
+def test_hinge_is_zero_inside_and_once_differentiable():
+    x = jnp.array([-1.0, -1e-9, 0.0, 1e-3, 2e-3, 5e-3])
+    np.testing.assert_allclose(hinge(x, 2e-3), [0, 0, 0, 2.5e-4, 1e-3, 4e-3], atol=1e-15)
+    slope = jax.vmap(jax.grad(lambda v: hinge(v, 2e-3)))(x)
+    np.testing.assert_allclose(slope, [0, 0, 0, 0.5, 1.0, 1.0], atol=1e-9)
+
+
+def test_robust_equals_the_pseudo_huber_loss(heavy):
+    motion = rest_motion(heavy.skeleton)[np.zeros(4, int)]
+    signals = jnp.asarray(np.random.default_rng(0).normal(size=(4, 3)))
+    kin = mf.forward_kinematics(heavy.skeleton, motion, signals)
+    plain, robust = mf.terms.Effort(0.1), mf.Robust(mf.terms.Effort(0.1), 1.5)
+    r = plain.residual(kin)
+    np.testing.assert_allclose(robust.residual(kin) ** 2 / 2, 1.5**2 * (jnp.sqrt(1 + (r / 1.5) ** 2) - 1), atol=1e-12)
