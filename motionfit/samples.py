@@ -155,7 +155,7 @@ class _Gait:
         flat = (own > FLAT[0] - STRIKE) & (own < FLAT[1] - STRIKE)
         rolled[:, [0, 2]] += (captured - rolled)[flat].mean(0)[[0, 2]]
         error = rolled - captured
-        ends = np.flatnonzero(stance)[[0, -1]]
+        ends = np.flatnonzero(stance)[[0, -1]].tolist()
         step = 1.0 / DENSE
 
         def jet(index: int, inward: int) -> list[np.ndarray]:

@@ -318,7 +318,7 @@ def _compose(order: str, degrees: np.ndarray) -> np.ndarray:
         turn = Rotation.from_euler(order, degrees, degrees=True)
     else:
         for axis, angle in zip(order, degrees.T, strict=True):
-            turn = turn * Rotation.from_euler(axis, angle, degrees=True)
+            turn = turn * Rotation.from_euler(axis, angle[:, None], degrees=True)
     return turn.as_quat(scalar_first=True)
 
 

@@ -78,7 +78,7 @@ def _joints(shape: BodyShape) -> dict[str, tuple[str | None, np.ndarray]]:
     stance = 0.052 + max(0.0, shape.thigh / h - 0.33) * 0.24  # thick thighs stand further apart
     places: dict[str, tuple[str | None, np.ndarray]] = {}
 
-    def put(name: str, parent: str | None, x: float, y: float, z: float) -> None:
+    def put(name: str, parent: str | None, x, y, z) -> None:
         places[name] = (parent, np.array([x, y, z]) * h)
 
     put("Hips", None, 0, leg + 0.028, -0.004)

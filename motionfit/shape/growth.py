@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import equinox as eqx
 import numpy as np
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 
 from motionfit._character import PART_OF_ROLE, Character
 from motionfit._motion import bind_pose
@@ -122,7 +122,7 @@ def _growth_axes(skeleton: Skeleton, positions: np.ndarray) -> np.ndarray:
     return axes
 
 
-def _one_ring_mean(faces: np.ndarray, count: int) -> coo_array:
+def _one_ring_mean(faces: np.ndarray, count: int) -> csr_array:
     """The matrix that averages a value over each vertex and the vertices connected to it."""
     rows = np.concatenate([faces[:, i] for i in (0, 1, 2, 0, 1, 2)])
     columns = np.concatenate([faces[:, i] for i in (1, 2, 0, 2, 0, 1)])

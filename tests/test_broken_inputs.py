@@ -1,0 +1,197 @@
+"""Broken inputs: each gets one line on stderr that says what and where, exit status 2, and no output file."""
+
+import json
+import pathlib
+import sys
+
+import numpy as np
+import pytest
+
+import motionfit as mf
+from motionfit import samples
+from motionfit.cli import main
+
+BVH = """HIERARCHY
+ROOT Hips
+{
+ OFFSET 0 0 0
+ CHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation Xrotation
+ JOINT Spine
+ {
+  OFFSET 0 1 0
+  CHANNELS 3 Zrotation Yrotation Xrotation
+  End Site
+  {
+   OFFSET 0 1 0
+  }
+ }
+}
+MOTION
+Frames: 2
+Frame Time: 0.01
+0 0 0 0 0 0 0 0 0
+0 0 0 0 0 0 0 0 0
+"""
+
+TEXTS = {
+    "cut in the hierarchy": (BVH[:120], "cut off"),
+    "cut in the frames": (BVH.rsplit("\n", 2)[0], "2 frames announced, 1 found"),
+    "a value missing": (BVH[:-4] + "\n", "frame 1 has"),
+    "more rows than announced": (BVH + "0 0 0 0 0 0 0 0 0\n", "more rows"),
+    "not a number": (BVH.replace("\n0 0 0 0 0 0 0 0 0\n", "\n0 0 nan 0 0 0 0 0 0\n", 1), "not finite in column 3"),
+    "a word for a number": (BVH.replace("\n0 0 0 0 0 0 0 0 0\n", "\n0 0 x 0 0 0 0 0 0\n", 1), "'x'"),
+    "frame time zero": (BVH.replace("0.01", "0"), "above 0"),
+    "no frames": (BVH.replace("Frames: 2", "Frames: 0"), "at least one"),
+    "no motion": (BVH.split("MOTION")[0], "without MOTION"),
+    "unbalanced braces": (BVH.replace(" }\n}\nMOTION", "}\nMOTION"), "braces are still open"),
+    "unknown channel": (BVH.replace("Zrotation Yrotation Xrotation\n  End", "Wrotation Yrotation Xrotation\n  End"), "Wrotation"),
+    "two joints of one name": (BVH.replace("JOINT Spine", "JOINT Hips"), "occur twice"),
+    "empty": ("", "empty"),
+    "another text": ("hello world\n", "no BVH keyword"),
+}
+
+
+def _run(monkeypatch, capsys, *arguments) -> tuple[int, str]:
+    monkeypatch.setattr(sys, "argv", ["motionfit", *map(str, arguments)])
+    with pytest.raises(SystemExit) as exit_:
+        main()
+    return exit_.value.code, capsys.readouterr().err
+
+
+def _refused(monkeypatch, capsys, tmp_path, clip, body, fact, *more):
+    out = tmp_path / "out.glb"
+    code, said = _run(monkeypatch, capsys, "adapt", clip, body, "-o", out, *more)
+    assert code == 2
+    assert said.count("\n") == 1 and said.startswith("motionfit: "), said
+    assert fact in said, said
+    assert not list(tmp_path.glob("out*"))
+
+
+@pytest.mark.parametrize("case", TEXTS)
+def test_broken_bvh(case, monkeypatch, capsys, tmp_path):
+    text, fact = TEXTS[case]
+    (tmp_path / "clip.bvh").write_text(text)
+    _refused(monkeypatch, capsys, tmp_path, tmp_path / "clip.bvh", "builtin:average", fact)
+
+
+def test_binary_noise(monkeypatch, capsys, tmp_path):
+    noise = np.random.default_rng(0).bytes(5000)
+    for name in ("clip.bvh", "clip.glb", "clip.npz"):
+        (tmp_path / name).write_bytes(noise)
+        _refused(monkeypatch, capsys, tmp_path, tmp_path / name, "builtin:average", name)
+
+
+def test_places_that_hold_no_file(monkeypatch, capsys, tmp_path):
+    (tmp_path / "walk.bvh").mkdir()
+    _refused(monkeypatch, capsys, tmp_path, tmp_path / "walk.bvh", "builtin:average", "folder")
+    _refused(monkeypatch, capsys, tmp_path, tmp_path / "wolk.bvh", "builtin:average", "did you mean walk.bvh")
+    _refused(monkeypatch, capsys, tmp_path, tmp_path / "walk.fbx", "builtin:average", "not read yet")
+    _refused(monkeypatch, capsys, tmp_path, "builtin:dance", "builtin:average", "builtin:walk")
+    _refused(monkeypatch, capsys, tmp_path, "builtin:walk", "builtin:giant", "average, slim, heavy, child")
+
+
+def test_no_permission(monkeypatch, capsys, tmp_path):
+    (tmp_path / "clip.bvh").write_text(BVH)
+
+    def refuse(self):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(pathlib.Path, "read_bytes", refuse)
+    _refused(monkeypatch, capsys, tmp_path, tmp_path / "clip.bvh", "builtin:average", "permission")
+
+
+def test_options_say_what_is_allowed(monkeypatch, capsys, tmp_path):
+    for more, fact in (
+        (("--blocks", "arms,nose"), "blocks: arms, legs"), (("--objective", "magic"), "vertex, capsule, joint"),
+        (("--girth", "arms"), "arms=1.3"), (("--girth", "nose=2"), "parts: arms, legs, trunk"),
+        (("--girth", "arms=99"), "0.1 to 5"), (("--fps", "0"), "frame rate"), (("--start", "90"), "start 90"),
+    ):  # fmt: skip
+        _refused(monkeypatch, capsys, tmp_path, "builtin:walk", "builtin:average", fact, *more)
+    code, said = _run(monkeypatch, capsys, "adapt", "builtin:walk", "builtin:average", "-o", tmp_path / "no" / "x.glb")
+    assert code == 2 and "mkdir" in said
+    code, said = _run(monkeypatch, capsys, "adapt", "builtin:walk", "builtin:average", "-o", tmp_path / "x.doc")
+    assert code == 2 and ".glb" in said
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory):
+    path = tmp_path_factory.mktemp("good") / "body.gltf"
+    mf.save(path, samples.walk(cycles=1), mf.load_character("builtin:child"))
+    return json.loads(path.read_text())
+
+
+def _accessor(document, data, index):
+    """Write over an accessor's bytes inside the data URI."""
+    import base64
+
+    view = document["bufferViews"][document["accessors"][index]["bufferView"]]
+    raw = bytearray(base64.b64decode(document["buffers"][0]["uri"].split(",")[1]))
+    raw[view["byteOffset"] : view["byteOffset"] + len(data)] = data
+    document["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(bytes(raw)).decode()
+
+
+def _no_skin(d):
+    del d["skins"], d["nodes"][-1]["skin"]
+
+
+def _no_mesh(d):
+    del d["nodes"][-1]["skin"]
+
+
+def _loop(d):
+    d["nodes"][3].setdefault("children", []).append(0)
+
+
+def _zero_weight(d):
+    _accessor(d, np.zeros(4, np.float32).tobytes(), d["meshes"][0]["primitives"][0]["attributes"]["WEIGHTS_0"])
+
+
+def _nan_position(d):
+    _accessor(d, np.full(3, np.nan, np.float32).tobytes(), d["meshes"][0]["primitives"][0]["attributes"]["POSITION"])
+
+
+def _joint_beyond(d):
+    _accessor(d, bytes([200] * 4), d["meshes"][0]["primitives"][0]["attributes"]["JOINTS_0"])
+
+
+def _accessor_beyond(d):
+    d["accessors"][0]["count"] = 10**7
+
+
+def _buffer_missing(d):
+    d["buffers"][0]["uri"] = "gone.bin"
+
+
+def _bind_count(d):
+    d["accessors"][d["skins"][0]["inverseBindMatrices"]]["count"] = 5
+
+
+def _no_weights(d):
+    del d["meshes"][0]["primitives"][0]["attributes"]["WEIGHTS_0"]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "fact"),
+    [
+        (_no_skin, "no skin"), (_no_mesh, "moves no mesh"), (_loop, "loop"), (_zero_weight, "no skin weight"),
+        (_nan_position, "not finite"), (_joint_beyond, "names joint 200"), (_accessor_beyond, "damaged"),
+        (_buffer_missing, "gone.bin"), (_bind_count, "inverse bind matrices"), (_no_weights, "skin weights"),
+    ],
+)  # fmt: skip
+def test_broken_gltf(good, spoil, fact, monkeypatch, capsys, tmp_path):
+    document = json.loads(json.dumps(good))
+    spoil(document)
+    (tmp_path / "body.gltf").write_text(json.dumps(document))
+    _refused(monkeypatch, capsys, tmp_path, "builtin:walk", tmp_path / "body.gltf", fact)
+
+
+def test_truncated_glb(monkeypatch, capsys, tmp_path):
+    mf.save(tmp_path / "body.glb", samples.walk(cycles=1), mf.load_character("builtin:child"))
+    whole = (tmp_path / "body.glb").read_bytes()
+    (tmp_path / "body.glb").write_bytes(whole[: len(whole) // 2])
+    _refused(monkeypatch, capsys, tmp_path, "builtin:walk", tmp_path / "body.glb", "cut off")
+
+
+def test_a_skeleton_without_the_roles_is_told_what_was_found(monkeypatch, capsys, tmp_path):
+    (tmp_path / "clip.bvh").write_text(BVH)
+    _refused(monkeypatch, capsys, tmp_path, tmp_path / "clip.bvh", "builtin:average", "found chest=Spine, hips=Hips")
