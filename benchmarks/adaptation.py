@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import motionfit as mf
+from motionfit import samples
 from motionfit._motion import Motion, joint_angles
 from motionfit.adapt import build_clearance, volume_depths
 from motionfit.metrics import derivative_ratio, skin_depths
@@ -115,7 +116,7 @@ def main() -> None:
     keys: list[str] = []
     clips = options.clips if options.data else ("builtin:walk",)
     for name in clips:
-        clip = mf.load_motion(options.data / f"{name}.bvh" if options.data else name)
+        clip = mf.load_motion(options.data / f"{name}.bvh") if options.data else samples.walk()
         for body in options.bodies if options.data else ("heavy", "child", "average*1.3"):
             stem, _, scale = body.partition("*")
             reference = mf.load_character(

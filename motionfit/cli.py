@@ -70,8 +70,8 @@ def metrics(
     import motionfit as mf
     from motionfit._progress import progress_bar
 
-    body, motion = mf.load_character(character), mf.load_motion(clip)
-    source = motion if reference_clip is None else mf.load_motion(reference_clip)
+    body, motion = mf.load_character(character), _load_clip(clip)
+    source = motion if reference_clip is None else _load_clip(reference_clip)
     other = None if reference is None else mf.load_character(reference)
     with progress_bar() as progress:
         measured = _measure_all(body, {"clip": mf.onto(motion, body.skeleton)}, mf.onto(source, body.skeleton),
@@ -120,7 +120,7 @@ def run_adapt(
     names = () if blocks.strip() == "none" else tuple(b.strip() for b in blocks.split(",") if b.strip())
     scales = parse_girth(girth) if girth else {}
     started = time.perf_counter()
-    motion = mf.load_motion(clip, unit=unit, up=up, roles=roles, start=start, end=end, fps=fps)
+    motion = _load_clip(clip, unit=unit, up=up, roles=roles, start=start, end=end, fps=fps)
     body = mf.load_character(character)
     other = mf.load_character(reference) if reference else (body if scales else None)
     if scales:
@@ -164,6 +164,20 @@ def run_adapt(
     typer.echo(f"{status.replace('_', ' ')} in {total:.1f} s; wrote " + ", ".join(str(p) for p in (out, report, plot) if p))
     if status != "converged" and names:
         raise typer.Exit(3)
+
+
+def _load_clip(clip: str, *, start=None, end=None, fps=None, **options):
+    """A clip from a file, or one of the built-in samples."""
+    import motionfit as mf
+    from motionfit.io import trim
+    from motionfit.samples import CLIPS
+
+    if not clip.startswith("builtin:"):
+        return mf.load_motion(clip, start=start, end=end, fps=fps, **options)
+    if (name := clip.removeprefix("builtin:")) not in CLIPS:
+        known = ", ".join(f"builtin:{k}" for k in CLIPS)
+        raise mf.InputError(f"{clip}: no such built-in clip; there are {known}")
+    return trim(CLIPS[name](), start=start, end=end, fps=fps, name=clip)
 
 
 class _CompileClock:

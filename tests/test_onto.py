@@ -44,7 +44,7 @@ def test_root_path_scales_with_the_legs(average):
     ratio = leg_length(child.skeleton) / leg_length(average.skeleton)
     lengths = [np.ptp(m.root[:, 2]) for m in (placed, walk)]
     assert abs(lengths[0] / lengths[1] - ratio) < 1e-9
-    assert abs(mf.metrics.posed_vertices(child, placed[::10])[..., 1].min(1)).max() < 0.03
+    assert abs(mf.metrics.posed_vertices(child, placed[::10])[..., 1].min(1)).max() < 0.045
 
 
 def test_a_turned_rest_pose_walks_the_same_way(average):

@@ -31,47 +31,39 @@ def load_motion(
     end: float | None = None,
     fps: float | None = None,
 ) -> Motion:
-    """Read a motion clip: .bvh, .glb, .gltf, or motionfit's own .npz; `builtin:walk` is the built-in sample.
+    """Read a motion clip: .bvh, .glb, .gltf, or motionfit's own .npz.
 
     `unit` [m per file unit] and `up` ("y", "z") override what a BVH seems to use; `rest_frame` says whether a
     first frame in T-pose is motion ("auto", "first", "none"); `roles` is a mapping role -> joint name, or a JSON
     file with one. `start`, `end` [s] cut the clip and `fps` [1/s] resamples it.
     """
     names = load_role_mapping(roles) if isinstance(roles, str | os.PathLike) else roles
-    if str(path).startswith("builtin:"):
-        motion = _builtin_clip(str(path))
+    ending = _ending(path, CLIPS, "a motion clip")
+    if ending == ".bvh":
+        motion = read_bvh(path, unit=unit, up=up, rest_frame=rest_frame, roles=names)
+    elif ending == ".npz":
+        motion = read_npz(path)
     else:
-        ending = _ending(path, CLIPS, "a motion clip")
-        if ending == ".bvh":
-            motion = read_bvh(path, unit=unit, up=up, rest_frame=rest_frame, roles=names)
-        elif ending == ".npz":
-            motion = read_npz(path)
-        else:
-            from motionfit.io.gltf import read_motion
+        from motionfit.io.gltf import read_motion
 
-            motion = read_motion(path, rest_frame=rest_frame, roles=names)
-    return _cut(motion, path, start, end, fps)
+        motion = read_motion(path, rest_frame=rest_frame, roles=names)
+    return trim(motion, start=start, end=end, fps=fps, name=str(path))
 
 
-def _builtin_clip(name: str) -> Motion:
-    from motionfit.samples import CLIPS as SAMPLES
-
-    if name.removeprefix("builtin:") not in SAMPLES:
-        raise InputError(f"{name}: no such built-in clip; there are {', '.join('builtin:' + k for k in SAMPLES)}")
-    return SAMPLES[name.removeprefix("builtin:")]()
-
-
-def _cut(motion: Motion, path, start: float | None, end: float | None, fps: float | None) -> Motion:
+def trim(
+    motion: Motion, *, start: float | None = None, end: float | None = None, fps: float | None = None, name: str = "clip"
+) -> Motion:
+    """The clip from `start` to `end` [s] at `fps` [1/s]; `name` is what errors call it."""
     duration = (motion.frame_count - 1) * float(motion.dt)
     low, high = start or 0.0, duration if end is None else end
     if not 0 <= low <= high or low > duration:
-        raise InputError(f"{path}: start {low:g} s and end {high:g} s do not lie in order within its {duration:.3f} s")
+        raise InputError(f"{name}: start {low:g} s and end {high:g} s do not lie in order within its {duration:.3f} s")
     if start is not None or end is not None:
         first, last = round(low / float(motion.dt)), round(min(high, duration) / float(motion.dt))
         motion = motion[first : last + 1]
     if fps is not None:
         if not 1 <= fps <= 1000:
-            raise InputError(f"{path}: a frame rate from 1 to 1000 per second is allowed, got {fps:g}")
+            raise InputError(f"{name}: a frame rate from 1 to 1000 per second is allowed, got {fps:g}")
         motion = resample(motion, fps)
     return motion
 
@@ -118,7 +110,7 @@ def describe(path: str | os.PathLike) -> dict:
     found: dict = {"file": str(path)}
     ending = pathlib.Path(path).suffix.lower()
     skeleton = None
-    if ending in CHARACTERS or (str(path).startswith("builtin:") and not str(path).endswith(":walk")):
+    if ending in CHARACTERS or str(path).startswith("builtin:"):
         character = load_character(path)
         skeleton, vertices = character.skeleton, np.asarray(character.skin.vertices_bind)
         found |= {"kind": "character", "vertices": len(vertices), "triangles": len(character.skin.faces),

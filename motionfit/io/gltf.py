@@ -469,8 +469,7 @@ class _Writer:
 def write_gltf(path: str | os.PathLike, motion: Motion, character: Character) -> None:
     """Write a skinned, animated character as .glb (or .gltf with the data inside), for the Khronos validator."""
     import json
-
-    from motionfit import __version__
+    from importlib.metadata import version
 
     skeleton, skin = character.skeleton, character.skin
     joints = len(skeleton.names)
@@ -515,7 +514,7 @@ def write_gltf(path: str | os.PathLike, motion: Motion, character: Character) ->
     nodes.append({"name": character.name, "mesh": 0, "skin": 0})
 
     document: dict = {
-        "asset": {"version": "2.0", "generator": f"motionfit {__version__}"},
+        "asset": {"version": "2.0", "generator": f"motionfit {version('motionfit')}"},
         "scene": 0,
         "scenes": [{"nodes": [0, len(nodes) - 1]}],
         "nodes": nodes,

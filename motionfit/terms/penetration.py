@@ -95,7 +95,7 @@ class SkinClearance(Term):
     probes: tuple[Probes, ...]
     sections: tuple[Section, ...]
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
-    counted: tuple[Float[AnyArray, " points"], ...]
+    counted: tuple[Float[AnyArray, "_"], ...]  # one length per pair
     allowed: Float[AnyArray, "*frames pairs"]
     sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.01)
     width: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.002)
