@@ -122,7 +122,9 @@ def main() -> None:
             reference = mf.load_character(
                 options.data / f"characters/{options.reference}.glb" if options.data else "builtin:average"
             )
-            character = mf.load_character(options.data / f"characters/{stem}.glb" if options.data else f"builtin:{stem}")
+            character = mf.load_character(
+                options.data / f"characters/{stem}.glb" if options.data else f"builtin:{stem}"
+            )
             if scale:
                 reference = character
                 character = grow(character, dict.fromkeys(("arms", "legs", "trunk"), float(scale)))

@@ -1,9 +1,9 @@
 """motionfit adapts a motion clip to the shape of a character, with exact gradients in JAX.
 
-    import motionfit as mf
+import motionfit as mf
 
-    fit = mf.adapt(mf.load_motion("walk.bvh"), mf.load_character("heavy.glb"))
-    mf.save("adapted.glb", fit.motion, mf.load_character("heavy.glb"))
+fit = mf.adapt(mf.load_motion("walk.bvh"), mf.load_character("heavy.glb"))
+mf.save("adapted.glb", fit.motion, mf.load_character("heavy.glb"))
 """
 
 __version__ = "0.1.0"

@@ -143,9 +143,7 @@ def load_correction(path: str | pathlib.Path) -> Correction:
         raise InputError(f"{path}: an .npz file, but not a correction; write one with fit.correction.save(path)")
     controls, points = [], []
     for k, c in enumerate(json.loads(str(arrays["motionfit_correction"]))):
-        drives = tuple(
-            Drive(j, arrays[f"{k}.{i}.axis"], arrays[f"{k}.{i}.gain"]) for i, j in enumerate(c["joints"])
-        )
+        drives = tuple(Drive(j, arrays[f"{k}.{i}.axis"], arrays[f"{k}.{i}.gain"]) for i, j in enumerate(c["joints"]))
         basis = Basis(arrays[f"{k}.first"], arrays[f"{k}.values"], c["count"])
         controls.append(Control(c["name"], drives, basis, arrays[f"{k}.lower"], arrays[f"{k}.upper"]))
         points.append(arrays[f"{k}.points"])

@@ -263,5 +263,3 @@ def _check(block: Block, problem: Problem, names: list[str]) -> None:
     if energies and least_squares:
         raise InputError(f"block {block.name!r} has a least-squares solver, but {', '.join(energies)} is an Energy; "
                          "give Block(solver=optx.BFGS(rtol=1e-4, atol=1e-6)) or leave it out of terms=")  # fmt: skip
-
-

@@ -158,7 +158,9 @@ def forward_kinematics(
     )
 
 
-def host_kinematics(motion: Motion) -> tuple[Float[np.ndarray, "frames joints 3"], Float[np.ndarray, "frames joints 4"]]:
+def host_kinematics(
+    motion: Motion,
+) -> tuple[Float[np.ndarray, "frames joints 3"], Float[np.ndarray, "frames joints 4"]]:
     """World positions [m] and rotations in double precision whatever JAX's mode is, without compiling anything:
     for files, set-up and measures."""
     skeleton, rotations = motion.skeleton, np.asarray(motion.rotations, float)

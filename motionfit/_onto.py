@@ -138,7 +138,12 @@ def _targets(source: Skeleton, skeleton: Skeleton, away: list[Rotation]) -> dict
     for joint, name in enumerate(skeleton.names):
         # fingers and other joints without a role that both have; they follow the alignment of their limb
         match = names.get(name.casefold())
-        if joint not in known and match is not None and match not in source.role_of_joint and skeleton.parents[joint] >= 0:
+        if (
+            joint not in known
+            and match is not None
+            and match not in source.role_of_joint
+            and skeleton.parents[joint] >= 0
+        ):
             targets[joint] = away[match]
     return targets
 
@@ -158,4 +163,3 @@ def _root_path(motion: Motion, clip_positions: np.ndarray, skeleton: Skeleton, p
     root = np.asarray(motion.root, float) * scale
     root[:, 1] += above_leg(skeleton, positions) - scale * above_leg(source, clip_positions)
     return root
-

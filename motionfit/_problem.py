@@ -179,5 +179,3 @@ def term_cost(term: Term | Energy, kin: Kinematics) -> Float[Array, ""]:
     if isinstance(term, Energy):
         return term.energy(kin)
     return 0.5 * jnp.sum(jnp.square(term.residual(kin)))
-
-

@@ -35,7 +35,9 @@ class Skin(eqx.Module):
             raise InputError(f"{count} vertices but skin joints {self.joints.shape} and weights {self.weights.shape}")
         for name, array in (("position", self.vertices_bind), ("weight", self.weights)):
             if not np.isfinite(array).all():
-                raise InputError(f"vertex {int(np.argwhere(~np.isfinite(array))[0][0])} has a {name} that is not finite")
+                raise InputError(
+                    f"vertex {int(np.argwhere(~np.isfinite(array))[0][0])} has a {name} that is not finite"
+                )
         sums = self.weights.sum(-1)
         if (sums <= 0).any():
             raise InputError(f"vertex {int(np.argmin(sums))} has no skin weight ({int((sums <= 0).sum())} in all); "
@@ -89,9 +91,7 @@ def skin_points(
     return total
 
 
-def skin(
-    mesh: Skin, kin: Kinematics
-) -> tuple[Float[Array, "frames vertices 3"], Float[Array, "frames vertices 3"]]:
+def skin(mesh: Skin, kin: Kinematics) -> tuple[Float[Array, "frames vertices 3"], Float[Array, "frames vertices 3"]]:
     """World vertices [m] and unit normals of the whole skin in every frame: (4.20)."""
     vertices = skin_points(kin, mesh.vertices_bind, mesh.joints, mesh.weights)
     joints, weights, normals_bind = jnp.asarray(mesh.joints), jnp.asarray(mesh.weights), mesh.normals_bind

@@ -21,7 +21,11 @@ CharacterArgument = Annotated[str, typer.Argument(help="character: .glb, .gltf, 
 
 
 @app.command()
-def demo(out: Annotated[pathlib.Path, typer.Option(help="folder for adapted.glb, report.json, report.png")] = pathlib.Path("demo")) -> None:
+def demo(
+    out: Annotated[pathlib.Path, typer.Option(help="folder for adapted.glb, report.json, report.png")] = pathlib.Path(
+        "demo"
+    ),
+) -> None:
     """Adapt the built-in walk to the built-in heavy body."""
     from motionfit._types import InputError
 
@@ -40,7 +44,9 @@ def adapt(
     clip: ClipArgument,
     character: CharacterArgument,
     out: Annotated[pathlib.Path, typer.Option("-o", "--out", help="output: .glb, .gltf, .bvh or .npz")],
-    girth: Annotated[str | None, typer.Option(help="PART=SCALE,… e.g. arms=1.3,trunk=1.5; one number grows all")] = None,
+    girth: Annotated[
+        str | None, typer.Option(help="PART=SCALE,… e.g. arms=1.3,trunk=1.5; one number grows all")
+    ] = None,
     reference: Annotated[str | None, typer.Option(help="the body that the clip was made for")] = None,
     blocks: Annotated[str, typer.Option(help="arms,legs in the order to run, or none")] = "arms,legs",
     objective: Annotated[str, typer.Option(help="vertex, capsule or joint")] = "vertex",
@@ -161,7 +167,9 @@ def run_adapt(
         report_picture(plot, body, base, motions["after"], excess["before"], excess["after"], pairs,
                        f"{clip} on {body.name}: {status.replace('_', ' ')}")  # fmt: skip
     _print_table(measured)
-    typer.echo(f"{status.replace('_', ' ')} in {total:.1f} s; wrote " + ", ".join(str(p) for p in (out, report, plot) if p))
+    typer.echo(
+        f"{status.replace('_', ' ')} in {total:.1f} s; wrote " + ", ".join(str(p) for p in (out, report, plot) if p)
+    )
     if status != "converged" and names:
         raise typer.Exit(3)
 
@@ -209,7 +217,9 @@ def _measure_all(body, motions: dict, source, clip, reference, progress) -> dict
     step = max(1, round(some.frame_rate / 30))
     own = None
     if reference is not None:
-        own = skin_depths(reference, mf.onto(clip, reference.skeleton), step=step, progress=progress.task("reference skin"))
+        own = skin_depths(
+            reference, mf.onto(clip, reference.skeleton), step=step, progress=progress.task("reference skin")
+        )
     result = {}
     for name, motion in motions.items():
         excess = volume_depths(clearance, motion) - limit

@@ -138,9 +138,7 @@ def skin_depths(
     return SkinDepths(result, inside / (probed * max(len(frames), 1)), frames)
 
 
-def penetration_summary(
-    excess: Float[np.ndarray, "frames pairs"], pairs: Sequence[Pair] = PAIRS
-) -> dict:
+def penetration_summary(excess: Float[np.ndarray, "frames pairs"], pairs: Sequence[Pair] = PAIRS) -> dict:
     """report.json's penetration entry from excess depths [m]: how much deeper than on the reference."""
     excess = np.maximum(np.nan_to_num(np.asarray(excess, float)), 0.0)
     return {

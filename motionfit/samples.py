@@ -71,7 +71,7 @@ class _Gait:
         )
         leg = self.thigh + self.shank
         self.leg = leg
-        (stride, period), = HARMONICS["stride"]
+        ((stride, period),) = HARMONICS["stride"]
         self.stride, self.duration = stride * leg, period * np.sqrt(leg / 9.81)
         # the sole in the foot's frame, below the ankle: it lies on the ground at bind
         ankle = self.bind[joint["left_foot"]]
@@ -108,8 +108,11 @@ class _Gait:
         """Hip centre in the frame that advances steadily: (frames, 3) [m], heights over the ground."""
         offset = _turn("pelvis", phase) * self.leg
         # the captured height is over the lowest toe joint; ours over the sole
-        offset[:, 1] = 0.955 * self.leg + self.bind[self.joint["left_foot"]][1] + self.height_offset + (
-            offset[:, 1] - HARMONICS["pelvis"][0][1] * self.leg
+        offset[:, 1] = (
+            0.955 * self.leg
+            + self.bind[self.joint["left_foot"]][1]
+            + self.height_offset
+            + (offset[:, 1] - HARMONICS["pelvis"][0][1] * self.leg)
         )
         return offset
 
@@ -118,7 +121,9 @@ class _Gait:
 
     def _hip_joint(self, side: str, phase: np.ndarray) -> np.ndarray:
         both = [self.bind[self.joint[f"{s}_thigh"]] for s in ("left", "right")]
-        return self._pelvis(phase) + self._hips(phase).apply(self.bind[self.joint[f"{side}_thigh"]] - np.mean(both, axis=0))
+        return self._pelvis(phase) + self._hips(phase).apply(
+            self.bind[self.joint[f"{side}_thigh"]] - np.mean(both, axis=0)
+        )
 
     def _yaw(self, side: str) -> float:
         """Toes a little out, the same through the cycle: a planted foot must not turn."""
@@ -234,7 +239,9 @@ class _Gait:
         for role, bone in (("thigh", thigh), ("calf", shank)):
             a, b = (self.bind[joint[f"{side}_{r}"]] for r in (role, {"thigh": "calf", "calf": "foot"}[role]))
             rest = (b - a) / np.linalg.norm(b - a)
-            world[joint[f"{side}_{role}"]] = _frames(bone, side_way) * _frames(rest[None], np.array([[-1.0, 0, 0]])).inv()
+            world[joint[f"{side}_{role}"]] = (
+                _frames(bone, side_way) * _frames(rest[None], np.array([[-1.0, 0, 0]])).inv()
+            )
         turn = self._foot_turn(side, phase)
         world[joint[f"{side}_foot"]] = turn
         # toes stay on the ground while the heel rises

@@ -63,7 +63,9 @@ def cycles(path: pathlib.Path) -> list[dict[str, np.ndarray]]:
         hips = np.mean([rest_positions[skeleton.joint(f"{s}_thigh")] for s in ("left", "right")], axis=0)
         drop = rest_positions[0][1] - hips[1]
         ground = min(positions[start:end, skeleton.joint(f"{s}_toe"), 1].min() for s in ("left", "right"))
-        cycle["pelvis"] = np.stack([place[:, 0] - path_x, place[:, 1] - drop - ground, place[:, 2] - path_z], axis=1) / leg
+        cycle["pelvis"] = (
+            np.stack([place[:, 0] - path_x, place[:, 1] - drop - ground, place[:, 2] - path_z], axis=1) / leg
+        )
         cycle["stride"] = np.array([(root[end, 2] - root[start, 2]) / leg, duration / np.sqrt(leg / 9.81)])
         found.append(cycle)
     return found
@@ -72,7 +74,9 @@ def cycles(path: pathlib.Path) -> list[dict[str, np.ndarray]]:
 def symmetric(cycle: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The mean of a cycle and its mirror image half a cycle later; the left side stands for both."""
     half = SAMPLES // 2
-    result = {role: (cycle[role] + np.roll(cycle[role], -half, axis=0) * MIRROR) / 2 for role in MIDDLE if role in cycle}
+    result = {
+        role: (cycle[role] + np.roll(cycle[role], -half, axis=0) * MIRROR) / 2 for role in MIDDLE if role in cycle
+    }
     for role in SIDED:
         left, right = cycle[f"left_{role}"], np.roll(cycle[f"right_{role}"], -half, axis=0) * MIRROR
         result[role] = (left + right) / 2

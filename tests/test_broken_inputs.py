@@ -44,7 +44,10 @@ TEXTS = {
     "no frames": (BVH.replace("Frames: 2", "Frames: 0"), "at least one"),
     "no motion": (BVH.split("MOTION")[0], "without MOTION"),
     "unbalanced braces": (BVH.replace(" }\n}\nMOTION", "}\nMOTION"), "braces are still open"),
-    "unknown channel": (BVH.replace("Zrotation Yrotation Xrotation\n  End", "Wrotation Yrotation Xrotation\n  End"), "Wrotation"),
+    "unknown channel": (
+        BVH.replace("Zrotation Yrotation Xrotation\n  End", "Wrotation Yrotation Xrotation\n  End"),
+        "Wrotation",
+    ),
     "two joints of one name": (BVH.replace("JOINT Spine", "JOINT Hips"), "occur twice"),
     "empty": ("", "empty"),
     "another text": ("hello world\n", "no BVH keyword"),

@@ -18,7 +18,9 @@ def still(average):
 
 def _control(character, motion, role, name=None, **bounds):
     basis = bspline_basis(motion.frame_count, float(motion.dt), 0.1)
-    return mf.Control(name or role, (mf.Drive(character.skeleton.joint(role), np.array([0, 0, 1.0]), 1.0),), basis, **bounds)
+    return mf.Control(
+        name or role, (mf.Drive(character.skeleton.joint(role), np.array([0, 0, 1.0]), 1.0),), basis, **bounds
+    )
 
 
 def test_basis_sums_to_one_and_reproduces_lines():
@@ -38,7 +40,9 @@ def test_least_squares_block_reaches_the_known_minimum(still):
     def towards(kin, goal):
         return (kin.signals - goal) / 0.1
 
-    problem = mf.Problem(character, motion, {"goal": mf.Custom(towards, target), "effort": mf.terms.Effort(0.1)}, (control,))
+    problem = mf.Problem(
+        character, motion, {"goal": mf.Custom(towards, target), "effort": mf.terms.Effort(0.1)}, (control,)
+    )
     result = mf.fit(problem, (mf.Block("arm", ("left_upper_arm",)),))
     # two equal parabolas: the middle
     np.testing.assert_allclose(result.correction.signals(), target / 2, atol=1e-6)
@@ -48,17 +52,23 @@ def test_least_squares_block_reaches_the_known_minimum(still):
 def test_minimisers_and_energies_work_and_are_refused_to_least_squares(still):
     character, motion = still
     control = _control(character, motion, "left_upper_arm")
-    problem = mf.Problem(character, motion, {"style": mf.Energy(lambda kin, goal: jnp.sum((kin.signals - goal) ** 2), 0.2)}, (control,))
+    problem = mf.Problem(
+        character, motion, {"style": mf.Energy(lambda kin, goal: jnp.sum((kin.signals - goal) ** 2), 0.2)}, (control,)
+    )
     with pytest.raises(mf.InputError, match="BFGS"):
         mf.fit(problem, (mf.Block("b", ("left_upper_arm",)),))
-    result = mf.fit(problem, (mf.Block("b", ("left_upper_arm",), solver=optx.BFGS(rtol=1e-6, atol=1e-8), max_steps=100),))
+    result = mf.fit(
+        problem, (mf.Block("b", ("left_upper_arm",), solver=optx.BFGS(rtol=1e-6, atol=1e-8), max_steps=100),)
+    )
     np.testing.assert_allclose(result.correction.signals(), 0.2, atol=1e-3)
 
 
 def test_bounds_clamp_control_points(still):
     character, motion = still
     control = _control(character, motion, "left_upper_arm", lower=-0.1, upper=0.1)
-    problem = mf.Problem(character, motion, {"goal": mf.Custom(lambda kin, g: (kin.signals - g) / 0.1, 0.5)}, (control,))
+    problem = mf.Problem(
+        character, motion, {"goal": mf.Custom(lambda kin, g: (kin.signals - g) / 0.1, 0.5)}, (control,)
+    )
     result = mf.fit(problem, (mf.Block("arm", ("left_upper_arm",)),))
     assert float(result.correction.signals().max()) <= 0.1 + 1e-12
 

@@ -8,7 +8,10 @@ from motionfit._skeleton import LIMB_ROLES, SIDES
 
 BIPED = ["Bip01", "Bip01 Pelvis", "Bip01 Spine", "Bip01 Spine1", "Bip01 Spine2", "Bip01 Neck", "Bip01 Head"]
 for _s in "LR":
-    BIPED += [f"Bip01 {_s} {n}" for n in ("Clavicle", "UpperArm", "Forearm", "Hand", "Finger0", "Thigh", "Calf", "Foot", "Toe0")]
+    BIPED += [
+        f"Bip01 {_s} {n}"
+        for n in ("Clavicle", "UpperArm", "Forearm", "Hand", "Finger0", "Thigh", "Calf", "Foot", "Toe0")
+    ]
 MIXAMO = ["Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"]
 for _s in ("Left", "Right"):
     MIXAMO += [_s + n for n in ("Shoulder", "Arm", "ForeArm", "Hand", "HandIndex1", "UpLeg", "Leg", "Foot", "ToeBase")]
@@ -22,7 +25,11 @@ def _flat(names, **options):
     return mf.Skeleton(names, parents, np.zeros((len(names), 3)), **options)
 
 
-@pytest.mark.parametrize("names", [BIPED, MIXAMO, [f"mixamorig:{n}" for n in MIXAMO], UNREAL], ids=["biped", "motionbuilder", "mixamo", "unreal"])
+@pytest.mark.parametrize(
+    "names",
+    [BIPED, MIXAMO, [f"mixamorig:{n}" for n in MIXAMO], UNREAL],
+    ids=["biped", "motionbuilder", "mixamo", "unreal"],
+)
 def test_conventions_give_every_role(names):
     skeleton = _flat(names)
     skeleton.require("hips", "chest", "head", *(f"{s}_{r}" for s in SIDES for r in LIMB_ROLES))

@@ -20,7 +20,9 @@ def test_length_and_figures(walk):
     np.testing.assert_allclose(np.linalg.norm(walk.rotations, axis=-1), 1.0, atol=1e-9)
     assert 1.1 < gait.stride / gait.duration < 1.45
     assert 100 < 120 / gait.duration < 120
-    assert np.ptp(walk.root[:, 2]) / ((walk.frame_count - 1) / 60) == pytest.approx(gait.stride / gait.duration, rel=0.02)
+    assert np.ptp(walk.root[:, 2]) / ((walk.frame_count - 1) / 60) == pytest.approx(
+        gait.stride / gait.duration, rel=0.02
+    )
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

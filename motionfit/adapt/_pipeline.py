@@ -97,7 +97,9 @@ def adapt(
 
     def problem_of(recipes: list[_Recipe]) -> Problem:
         terms: dict[str, Term] = {f"{r.name}_clearance": r.clearance.allowing(r.allowed_rows) for r in recipes}
-        return Problem(character, base, terms | {"effort": effort, "smoothness": Smoothness(SIGMA_BEND)}, tuple(controls))
+        return Problem(
+            character, base, terms | {"effort": effort, "smoothness": Smoothness(SIGMA_BEND)}, tuple(controls)
+        )
 
     rounds = 1 + (SKIN_ROUNDS if reference is not None and objective == "vertex" else 0)
     total, history, correction, own = rounds * sweeps * len(made), [], None, None
@@ -118,7 +120,8 @@ def adapt(
             break
         recipes = _tighten(recipes, pairs, seen.frames, excess, base.frame_count, float(base.dt))
     before, after = (
-        np.concatenate([volume_depths(r.clearance, m) - r.limit for r in recipes], axis=1) for m in (base, result.motion)
+        np.concatenate([volume_depths(r.clearance, m) - r.limit for r in recipes], axis=1)
+        for m in (base, result.motion)
     )
     status = "violations_left" if after.max(initial=0.0) > TOLERANCE else "converged"
     details = {"pairs": [p.name for r in recipes for p in r.clearance.pairs],

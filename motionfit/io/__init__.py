@@ -51,7 +51,12 @@ def load_motion(
 
 
 def trim(
-    motion: Motion, *, start: float | None = None, end: float | None = None, fps: float | None = None, name: str = "clip"
+    motion: Motion,
+    *,
+    start: float | None = None,
+    end: float | None = None,
+    fps: float | None = None,
+    name: str = "clip",
 ) -> Motion:
     """The clip from `start` to `end` [s] at `fps` [1/s]; `name` is what errors call it."""
     duration = (motion.frame_count - 1) * float(motion.dt)

@@ -9,7 +9,7 @@ import equinox as eqx
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from motionfit._motion import Motion, host_kinematics, rest_motion
+from motionfit._motion import Motion, host_kinematics
 from motionfit._skeleton import Skeleton
 from motionfit._types import InputError
 
@@ -195,7 +195,9 @@ def _read_frames(lines: _Lines, width: int) -> tuple[float, np.ndarray]:
             wrong = next(w for w in words if not _is_number(w))
             raise lines.fail(f"frame {len(rows)} holds {wrong[:20]!r}, which is no number") from None
         if not np.isfinite(row).all():
-            raise lines.fail(f"frame {len(rows)} holds a value that is not finite in column {int(np.argmin(np.isfinite(row))) + 1}")
+            raise lines.fail(
+                f"frame {len(rows)} holds a value that is not finite in column {int(np.argmin(np.isfinite(row))) + 1}"
+            )
         rows.append(row)
     if len(rows) < count:
         raise lines.fail(f"{count} frames announced, {len(rows)} found; the file seems cut off", len(lines.lines) - 1)

@@ -293,7 +293,9 @@ def read_character(path: str | os.PathLike, *, roles: Mapping[str, str] | None =
     vertices = vertices @ rig.mesh_to_world[:3, :3].T + rig.mesh_to_world[:3, 3]
     try:
         if not np.isfinite(vertices).all():
-            raise InputError(f"vertex {int(np.argwhere(~np.isfinite(vertices))[0][0])} has a position that is not finite")
+            raise InputError(
+                f"vertex {int(np.argwhere(~np.isfinite(vertices))[0][0])} has a position that is not finite"
+            )
         vertices, faces, joints, weights = _weld(vertices, faces, joints, weights)
         return Character(rig.skeleton, Skin(vertices, faces, joints, weights), pathlib.Path(path).stem)
     except InputError as error:
@@ -350,9 +352,7 @@ def _weld(vertices, faces, joints, weights):
     return vertices[keep], faces[whole], joints[keep].astype(np.int32), weights[keep]
 
 
-def read_motion(
-    path: str | os.PathLike, *, rest_frame: str = "auto", roles: Mapping[str, str] | None = None
-) -> Motion:
+def read_motion(path: str | os.PathLike, *, rest_frame: str = "auto", roles: Mapping[str, str] | None = None) -> Motion:
     """The first animation of a glTF file, sampled at the rate of its keys, on its skin's skeleton."""
     document = _Document(path)
     rig = _Rig(document, roles)

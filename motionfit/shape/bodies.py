@@ -227,9 +227,19 @@ def _trunk(shape: BodyShape, at: dict[str, np.ndarray], x: np.ndarray) -> np.nda
         (hip_y - 0.075 * h, hip[0] * 0.42, hip[1] * 0.52, -0.006 * h),
         (hip_y - 0.035 * h, hip[0] * 0.80, hip[1] * 0.86, -0.007 * h),
         (hip_y + 0.005 * h, hip[0] * 0.99, hip[1] * 1.00, -0.008 * h),
-        (hip_y + 0.050 * h, 0.55 * hip[0] + 0.45 * waist[0], 0.55 * hip[1] + 0.45 * waist[1], (0.010 * stout - 0.004) * h),
+        (
+            hip_y + 0.050 * h,
+            0.55 * hip[0] + 0.45 * waist[0],
+            0.55 * hip[1] + 0.45 * waist[1],
+            (0.010 * stout - 0.004) * h,
+        ),
         (waist_y, waist[0], waist[1], (0.020 * stout + 0.001) * h),
-        (0.5 * (waist_y + chest_y), 0.45 * waist[0] + 0.55 * chest[0], 0.5 * (waist[1] + chest[1]), (0.012 * stout) * h),
+        (
+            0.5 * (waist_y + chest_y),
+            0.45 * waist[0] + 0.55 * chest[0],
+            0.5 * (waist[1] + chest[1]),
+            (0.012 * stout) * h,
+        ),
         (chest_y, chest[0], chest[1], 0.002 * h),
         (shoulder[1] - 0.028 * h, chest[0] * 0.93, chest[1] * 0.88, -0.004 * h),
         (shoulder[1] + 0.004 * h, shoulder[0] * 0.86, chest[1] * 0.62, -0.012 * h),
@@ -252,10 +262,14 @@ def _trunk(shape: BodyShape, at: dict[str, np.ndarray], x: np.ndarray) -> np.nda
         buttock = at["LeftUpLeg"] * [sign, 1, 1] + [0, -0.004 * h, -0.55 * hip[1]]
         body = _smooth_min(body, _ellipsoid(x, buttock, np.array([0.48 * hip[0], 0.052 * h, 0.62 * hip[1]])), 0.03 * h)
         pectoral = [sign * 0.46 * chest[0], chest_y + 0.020 * h, 0.58 * chest[1]]
-        body = _smooth_min(body, _ellipsoid(x, pectoral, np.array([0.46 * chest[0], 0.042 * h, 0.46 * chest[1]])), 0.025 * h)
+        body = _smooth_min(
+            body, _ellipsoid(x, pectoral, np.array([0.46 * chest[0], 0.042 * h, 0.46 * chest[1]])), 0.025 * h
+        )
     if stout > 0.3:
         belly = [0, waist_y - 0.025 * h, 0.48 * waist[1]]
-        body = _smooth_min(body, _ellipsoid(x, belly, np.array([0.80 * waist[0], 0.075 * h, 0.66 * waist[1]])), 0.04 * h)
+        body = _smooth_min(
+            body, _ellipsoid(x, belly, np.array([0.80 * waist[0], 0.075 * h, 0.66 * waist[1]])), 0.04 * h
+        )
 
     # head: height from chin to vertex is `head`
     head, top = shape.head, h
@@ -263,7 +277,9 @@ def _trunk(shape: BodyShape, at: dict[str, np.ndarray], x: np.ndarray) -> np.nda
     skull = [0, top - 0.40 * head, -0.006 * h]
     field = _ellipsoid(x, skull, np.array([0.335 * head * fat, 0.40 * head, 0.425 * head]))
     face = [0, top - 0.60 * head, 0.105 * head]
-    field = _smooth_min(field, _ellipsoid(x, face, np.array([0.27 * head * fat, 0.36 * head, 0.30 * head])), 0.10 * head)
+    field = _smooth_min(
+        field, _ellipsoid(x, face, np.array([0.27 * head * fat, 0.36 * head, 0.30 * head])), 0.10 * head
+    )
     chin = [0, top - 0.91 * head, 0.235 * head]
     field = _smooth_min(field, _ellipsoid(x, chin, np.array([0.13, 0.085, 0.11]) * head * fat), 0.12 * head)
     nose = [0, top - 0.60 * head, 0.415 * head]
@@ -374,7 +390,9 @@ def _grid(shape: BodyShape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     y = lines(-0.02 * h, [(0.06 * h, fine), (hand_low, 1.25 * coarse), (wrist[1] + 0.01 * h, 0.8 * coarse),
                           (h - shape.head, coarse), (h + 0.02 * h, 0.75 * coarse)])  # fmt: skip
     deep = 0.5 * _half_axes(shape.waist, 0.9)[1] + 0.085 * h
-    z = lines(-deep - 0.03 * h, [(-0.05 * h, coarse), (0.06 * h, 0.7 * coarse), (max(0.13 * h, deep + 0.08 * h), coarse)])
+    z = lines(
+        -deep - 0.03 * h, [(-0.05 * h, coarse), (0.06 * h, 0.7 * coarse), (max(0.13 * h, deep + 0.08 * h), coarse)]
+    )
     return x, y, z
 
 

@@ -32,7 +32,10 @@ def closest_on_lines(
 
 
 def segment_distance(
-    p0: Float[AnyArray, "... 3"], p1: Float[AnyArray, "... 3"], q0: Float[AnyArray, "... 3"], q1: Float[AnyArray, "... 3"]
+    p0: Float[AnyArray, "... 3"],
+    p1: Float[AnyArray, "... 3"],
+    q0: Float[AnyArray, "... 3"],
+    q1: Float[AnyArray, "... 3"],
 ) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
     """Distance [m] of two segments, and where on each (0..1) it is reached: exact, parallel segments included.
 
@@ -51,7 +54,9 @@ def segment_distance(
     zero, one = jnp.zeros_like(s), jnp.ones_like(s)
     candidates_s = jnp.stack([jnp.clip(s, 0, 1), zero, one, foot(q0, p0, u), foot(q1, p0, u)], axis=-1)
     candidates_t = jnp.stack([jnp.clip(t, 0, 1), foot(p0, q0, v), foot(p1, q0, v), zero, one], axis=-1)
-    apart = (p0 - q0)[..., None, :] + candidates_s[..., None] * u[..., None, :] - candidates_t[..., None] * v[..., None, :]
+    apart = (
+        (p0 - q0)[..., None, :] + candidates_s[..., None] * u[..., None, :] - candidates_t[..., None] * v[..., None, :]
+    )
     squared = jnp.sum(jnp.square(apart), axis=-1)
     # clamping both parameters of an outside solution is no minimum: leave it out
     squared = squared.at[..., 0].set(jnp.where(inside, squared[..., 0], jnp.inf))

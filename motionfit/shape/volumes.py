@@ -116,7 +116,9 @@ class Volumes(eqx.Module):
             raise InputError(f"no {self.kind} for {role!r}; there are {', '.join(self.roles)}")
         return self.roles.index(role)
 
-    def axes_world(self, kin: Kinematics) -> tuple[Float[Array, "frames segments 3"], Float[Array, "frames segments 3"]]:
+    def axes_world(
+        self, kin: Kinematics
+    ) -> tuple[Float[Array, "frames segments 3"], Float[Array, "frames segments 3"]]:
         """World start and end of every axis [m]."""
         joints = np.array(self.joints)
         turn, origin = kin.rotations_world[:, joints], kin.positions_world[:, joints]
@@ -139,7 +141,9 @@ def fit_volumes(character: Character, kind: str = "capsule") -> Volumes:
     vertices = np.asarray(character.skin.vertices_bind, float)
     positions, rotations = bind_pose(skeleton)
     tips = bone_tips(skeleton)
-    of_role = {role: [j for j in range(len(positions)) if skeleton.nearest_role(j) == role] for role, _ in skeleton.roles}
+    of_role = {
+        role: [j for j in range(len(positions)) if skeleton.nearest_role(j) == role] for role, _ in skeleton.roles
+    }
     rows = []
     for role, joint in skeleton.roles:
         mine = np.isin(owner, of_role[role])
@@ -317,7 +321,9 @@ def fit_section(character: Character, part: str) -> Section:
         waves += [np.cos(k * angle), np.sin(k * angle)]
     order = np.array([0] + [k for k in range(1, HARMONICS + 1) for _ in range(2)])
     design = (basis[:, :, None] * np.stack(waves, axis=1)[:, None, :]).reshape(len(points), -1)
-    penalty = np.kron(1e-4 * bend.T @ bend, np.eye(len(order))) + np.kron(np.eye(count), np.diag(1e-6 * order**4 + 1e-9))
+    penalty = np.kron(1e-4 * bend.T @ bend, np.eye(len(order))) + np.kron(
+        np.eye(count), np.diag(1e-6 * order**4 + 1e-9)
+    )
     radii = solve(design, rho, penalty).reshape(count, len(order))
     scales = _inclination(radii, low, high)
 
@@ -383,7 +389,9 @@ def sample_probes(character: Character, part: str, count: int) -> Probes:
     skin = character.skin
     mine = np.flatnonzero(character.part_of_vertex == PARTS.index(part))
     if len(mine) == 0:
-        raise InputError(f"{character.name}: part {part!r} has no vertices; check the skin weights and the role mapping")
+        raise InputError(
+            f"{character.name}: part {part!r} has no vertices; check the skin weights and the role mapping"
+        )
     points = np.asarray(skin.vertices_bind, float)[mine]
     chosen = [int(np.argmin(points @ np.array([0.3, 1.0, 0.2])))]
     distance = np.full(len(points), np.inf)

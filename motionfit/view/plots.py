@@ -69,7 +69,9 @@ def report_picture(
     figure = plt.figure(figsize=(15, 10.5), constrained_layout=True)
     grid = figure.add_gridspec(2, 1, height_ratios=[1.35, 1.0])
     bodies = grid[0].subgridspec(1, 2)
-    for column, (name, motion, excess) in enumerate((("before", before, excess_before), ("after", after, excess_after))):
+    for column, (name, motion, excess) in enumerate(
+        (("before", before, excess_before), ("after", after, excess_after))
+    ):
         axes = figure.add_subplot(bodies[column])
         _draw_moments(axes, character, motion, excess, moments, pairs)
         worst = 100 * float(np.maximum(excess, 0).max(initial=0.0))
@@ -142,5 +144,3 @@ def _draw_curve(axes, motion: Motion, before, after, name: str, top: float, inde
         axes.set_ylabel("excess [cm]", fontsize=9)
     if index == 0:
         axes.legend(fontsize=8, frameon=False)
-
-
