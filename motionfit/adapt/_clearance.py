@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from motionfit._character import Character
-from motionfit._motion import Kinematics, Motion, forward_kinematics, rest_motion
-from motionfit._skeleton import SIDES
+from motionfit._motion import Kinematics, Motion, bind_pose, forward_kinematics, rest_motion
+from motionfit._skeleton import SIDES, Skeleton
 from motionfit._types import InputError
 from motionfit.shape.pairs import Pair
 from motionfit.shape.volumes import fit_section, fit_volumes, sample_probes
@@ -131,6 +132,33 @@ def volume_depths(clearance: Clearance, motion: Motion) -> Float[np.ndarray, "fr
 def rest_depths(clearance: Clearance, character: Character) -> Float[np.ndarray, "1 pairs"]:
     """Depth [m] of every pair in the rest pose: what is allowed where there is no reference body."""
     return volume_depths(clearance, rest_motion(character.skeleton))
+
+
+def standing(skeleton: Skeleton) -> Motion:
+    """One frame of standing with the arms hanging 2 degrees from the vertical and straight, all else at bind."""
+    rest = rest_motion(skeleton)
+    positions, world = bind_pose(skeleton)
+    rotations = np.array(rest.rotations, float)
+    turned: dict[int, Rotation] = {}
+    for side in SIDES:
+        arm, elbow, hand = (skeleton.joint(f"{side}_{r}") for r in ("upper_arm", "forearm", "hand"))
+        sign = np.sign(positions[arm][0] - positions[skeleton.joint("chest")][0])
+        down = np.array([sign * np.sin(np.deg2rad(2)), -np.cos(np.deg2rad(2)), 0.0])
+        for joint, end in ((arm, elbow), (elbow, hand)):
+            bone = positions[end] - positions[joint]
+            laid, _ = Rotation.align_vectors(down[None], (bone / np.linalg.norm(bone))[None])
+            turned[joint] = laid * Rotation.from_quat(world[joint], scalar_first=True)
+    for joint in sorted(turned):
+        above, path = Rotation.identity(), []
+        parent = skeleton.parents[joint]
+        while parent >= 0 and parent not in turned:
+            path.append(parent)
+            parent = skeleton.parents[parent]
+        above = turned[parent] if parent >= 0 else above
+        for between in reversed(path):
+            above = above * Rotation.from_quat(rotations[0, between], scalar_first=True)
+        rotations[0, joint] = (above.inv() * turned[joint]).as_quat(scalar_first=True)
+    return Motion(skeleton, rest.root, rotations, rest.dt)
 
 
 def allowance(

@@ -14,7 +14,7 @@ from motionfit._motion import Motion
 from motionfit._onto import onto
 from motionfit._problem import Problem, Term
 from motionfit._types import InputError
-from motionfit.adapt._clearance import Clearance, allowance, build_clearance, rest_depths, volume_depths
+from motionfit.adapt._clearance import Clearance, allowance, build_clearance, rest_depths, standing, volume_depths
 from motionfit.adapt._controls import arm_controls, leg_controls
 from motionfit.metrics import TOLERANCE, skin_depths
 from motionfit.shape.growth import grow
@@ -80,6 +80,18 @@ def adapt(
     base = onto(clip, character.skeleton)
     pairs = pairs_of(*blocks)
     basis = bspline_basis(base.frame_count, float(base.dt), KNOT_SPACING)
+    step = max(1, round(SKIN_INTERVAL / float(base.dt)))
+    quiet = own_joint = np.zeros(len(pairs), bool)
+    if reference is not None:
+        # A pair that shows no violation is left alone. What the reference shows standing with its arms hanging is
+        # the joint's own overlap, at the armpit above all: measured against the reference frame by frame it would
+        # count as excess wherever a clip holds the arms out, as every adapted clip does, and each further
+        # adaptation would push them further out.
+        own = skin_depths(reference, onto(clip, reference.skeleton), pairs, step=step)
+        at_ease = skin_depths(reference, standing(reference.skeleton), pairs).depth
+        untouched = skin_depths(character, base, pairs, step=step).depth
+        own_joint = at_ease[0] > 0
+        quiet = (untouched - np.maximum(own.depth, at_ease)).max(axis=0) <= TOLERANCE
     controls: list[Control] = []
     made: list[Block] = []
     recipes: list[_Recipe] = []
@@ -87,7 +99,13 @@ def adapt(
         clearance = build_clearance(character, pairs_of(name), objective)
         limit = reference_depths(clip, character, reference, clearance.pairs, objective, clearance)
         excess = volume_depths(clearance, base) - limit
-        recipe = _Recipe(name, clearance, limit, limit + allowance(excess, ALLOWED_EXCESS, MARGIN))
+        allowed = limit + allowance(excess, ALLOWED_EXCESS, MARGIN)
+        if reference is not None:
+            mine = [pairs.index(p) for p in clearance.pairs]
+            alone = quiet[mine] & ((excess.max(axis=0) <= TOLERANCE) | own_joint[mine])
+            allowed = np.where(alone, np.maximum(allowed, excess + limit), allowed)
+            quiet[mine] = alone
+        recipe = _Recipe(name, clearance, limit, allowed)
         new = (arm_controls(character, base, clearance, recipe.allowed_rows, basis) if name == "arms"
                else leg_controls(character, base, basis))  # fmt: skip
         controls += new
@@ -102,7 +120,7 @@ def adapt(
         )
 
     rounds = 1 + (SKIN_ROUNDS if reference is not None and objective == "vertex" else 0)
-    total, history, correction, own = rounds * sweeps * len(made), [], None, None
+    total, history, correction = rounds * sweeps * len(made), [], None
     for round_ in range(rounds):
         problem = problem_of(recipes)
         result = fit(problem, made, sweeps, correction=correction, progress=None if progress is None else (
@@ -111,11 +129,8 @@ def adapt(
         if round_ == rounds - 1:
             break
         # the volumes are a model: what the skin itself still shows is taken off what they may keep
-        step = max(1, round(SKIN_INTERVAL / float(base.dt)))
-        if own is None:
-            own = skin_depths(reference, onto(clip, reference.skeleton), pairs, step=step)
         seen = skin_depths(character, result.motion, pairs, step=step)
-        excess = seen.depth - own.depth
+        excess = np.where(quiet, 0.0, seen.depth - own.depth)
         if excess.max(initial=0.0) <= SKIN_TOLERANCE:
             break
         recipes = _tighten(recipes, pairs, seen.frames, excess, base.frame_count, float(base.dt))
@@ -123,7 +138,9 @@ def adapt(
         np.concatenate([volume_depths(r.clearance, m) - r.limit for r in recipes], axis=1)
         for m in (base, result.motion)
     )
-    status = "violations_left" if after.max(initial=0.0) > TOLERANCE else "converged"
+    order = [pairs.index(p) for r in recipes for p in r.clearance.pairs]
+    left = after[:, ~quiet[order]].max(initial=0.0)
+    status = "violations_left" if left > TOLERANCE else "converged"
     details = {"pairs": [p.name for r in recipes for p in r.clearance.pairs],
                "excess_before_m": before, "excess_after_m": after}  # fmt: skip
     return Fit(correction, result.motion, base, status, tuple(history), problem, details)
