@@ -89,6 +89,7 @@ def adapt(
         # adaptation would push them further out.
         own = skin_depths(reference, onto(clip, reference.skeleton), pairs, step=step)
         at_ease = skin_depths(reference, standing(reference.skeleton), pairs).depth
+        at_ease = at_ease * np.array([p.adjacent for p in pairs])
         untouched = skin_depths(character, base, pairs, step=step).depth
         own_joint = at_ease[0] > 0
         quiet = (untouched - np.maximum(own.depth, at_ease)).max(axis=0) <= TOLERANCE

@@ -17,6 +17,11 @@ class Pair(NamedTuple):
     def name(self) -> str:
         return f"{self.first}/{self.second}"
 
+    @property
+    def adjacent(self) -> bool:
+        """Whether the two parts meet at a joint, so that some overlap is the joint's own."""
+        return self.first.endswith("upper_arm") or self.second.endswith("thigh") and self.first.endswith("thigh")
+
 
 PAIRS: tuple[Pair, ...] = (
     *(
