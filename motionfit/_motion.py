@@ -52,6 +52,19 @@ def rest_motion(skeleton: Skeleton, dt: float = 1 / 60) -> Motion:
     return Motion(skeleton, skeleton.offsets[:1], skeleton.rest_rotations[None], dt)
 
 
+def bucket(frame_count: int) -> int:
+    """The least of 16, 24, 32, 48, 64, 96, ... that is not below: clips of one bucket share a compiled program."""
+    size = 16
+    while size < frame_count:
+        size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
+    return size
+
+
+def padded(motion: Motion, frame_count: int) -> Motion:
+    """The motion with its last frame repeated up to `frame_count` frames."""
+    return motion[np.minimum(np.arange(frame_count), motion.frame_count - 1)]
+
+
 def resample(motion: Motion, frame_rate: float) -> Motion:
     """The clip at another frame rate [1/s]: positions linearly, rotations along the shortest arc (SciPy Slerp)."""
     if frame_rate <= 0:
