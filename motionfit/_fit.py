@@ -119,12 +119,14 @@ def _frame_local_rows(signals: Float[Array, "frames controls"], rows: Callable) 
 def _frame_local_rows_jvp(primals, tangents):
     signals, rows = primals
     t_signals, t_rows = tangents
-    value = rows(signals)
-    tangent = jnp.zeros_like(value)
     if t_signals is not None:
         seeds = jnp.eye(signals.shape[1], dtype=signals.dtype)[:, None, :] * jnp.ones_like(signals)
-        _, columns = jax.vmap(lambda seed: jax.jvp(rows, (signals,), (seed,)))(seeds)
-        tangent = tangent + jnp.einsum("tc,ctn->tn", t_signals, columns)
+        product = jax.vmap(lambda seed: jax.jvp(rows, (signals,), (seed,)), out_axes=(None, 0))
+        value, columns = product(seeds)
+        tangent = jnp.einsum("tc,ctn->tn", t_signals, columns)
+    else:
+        value = rows(signals)
+        tangent = jnp.zeros_like(value)
     if any(leaf is not None for leaf in jax.tree.leaves(t_rows)):
         _, extra = eqx.filter_jvp(lambda r: r(signals), (rows,), (t_rows,))
         tangent = tangent + extra

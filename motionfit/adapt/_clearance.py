@@ -1,5 +1,6 @@
 """Which overlaps have to go: clearance terms for a character, with what the reference body shows allowed."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,7 +14,7 @@ from motionfit._character import PARTS, Character
 from motionfit._motion import Kinematics, Motion, bucket, forward_kinematics, padded
 from motionfit._skeleton import SIDES
 from motionfit._types import InputError
-from motionfit.shape.field import fit_field, inside_depths, part_surface, sample_probes
+from motionfit.shape.field import Probes, fit_field, inside_depths, part_surface, sample_probes
 from motionfit.shape.pairs import Pair
 from motionfit.shape.volumes import fit_volumes
 from motionfit.terms.penetration import CapsuleClearance, JointClearance, SkinClearance
@@ -24,18 +25,21 @@ Term = SkinClearance | CapsuleClearance | JointClearance
 
 
 class Clearance(NamedTuple):
-    """A clearance term that still allows nothing, and which of `pairs` each of its rows speaks of."""
+    """A clearance term that still allows nothing, and which of `pairs` each of its rows (or sets of probes) speaks of."""
 
     term: Term
     pairs: tuple[Pair, ...]
     pair_of_row: tuple[int, ...]
+    part_of_set: tuple[str, ...] = ()  # whose skin the probes of a row are
 
-    def allowing(self, allowed: Float[np.ndarray, "frames rows"]) -> Term:
-        """The term with a depth [m] per frame and row that does not count."""
+    def allowing(self, allowed: Float[np.ndarray, "frames pairs"]) -> Term:
+        """The term with a depth [m] per frame and pair that does not count."""
+        rows = allowed[:, list(self.pair_of_row)]
         if isinstance(self.term, JointClearance):
-            limit = np.asarray(self.term.min_distance) - allowed
-            return eqx.tree_at(lambda t: t.min_distance, self.term, jnp.asarray(limit))
-        return eqx.tree_at(lambda t: t.allowed, self.term, jnp.asarray(allowed))
+            return eqx.tree_at(lambda t: t.min_distance, self.term, np.asarray(self.term.min_distance) - rows)
+        if isinstance(self.term, SkinClearance):
+            return eqx.tree_at(lambda t: t.allowed, self.term, tuple(rows[:, k, None] for k in range(rows.shape[1])))
+        return eqx.tree_at(lambda t: t.allowed, self.term, rows)
 
 
 def build_clearance(character: Character, pairs: tuple[Pair, ...], objective: str = "vertex") -> Clearance:
@@ -62,8 +66,9 @@ def _vertex(character: Character, pairs: tuple[Pair, ...]) -> Clearance:
     hit = list(dict.fromkeys(b for _, _, b in directed))
     fields = tuple(_of(character, fit_field, part) for part in hit)
     probes = tuple(_of(character, _counted_probes, a, b) for _, a, b in directed)
-    term = SkinClearance(probes, fields, tuple(hit.index(b) for _, _, b in directed), np.zeros((1, len(directed))))
-    return Clearance(term, pairs, tuple(k for k, _, _ in directed))
+    term = SkinClearance(probes, fields, tuple(hit.index(b) for _, _, b in directed),
+                         (np.zeros((1, 1)),) * len(directed))  # fmt: skip
+    return Clearance(term, pairs, tuple(k for k, _, _ in directed), tuple(a for _, a, _ in directed))
 
 
 def _of(character: Character, make, *parts: str):
@@ -156,8 +161,14 @@ def _row_depths(term: Term, kin: Kinematics, allowed) -> Float[Array, "frames ro
     return term.depth(kin)
 
 
-def _deepest(term: SkinClearance, kin: Kinematics, allowed) -> Float[Array, "rows points"]:
-    return jnp.stack([jnp.max(d - allowed[:, k, None], axis=0) for k, d in enumerate(term.point_depths(kin))])
+def _support(term: SkinClearance, kin: Kinematics, allowed) -> Float[Array, "sets points"]:
+    """How often a point is within 5 mm of its set's deepest, where the set is near to showing too much."""
+    counts = []
+    for k, depth in enumerate(term.point_depths(kin)):
+        deepest = jnp.max(depth, axis=1, keepdims=True)
+        matters = jax.nn.sigmoid((deepest - allowed[:, k, None]) / 0.01)
+        counts.append(jnp.sum(matters * jnp.clip(1.0 + (depth - deepest) / 0.005, 0.0, 1.0) + 1e-3 * depth, axis=0))
+    return jnp.stack(counts)
 
 
 def volume_depths(clearance: Clearance, motion: Motion) -> Float[np.ndarray, "frames pairs"]:
@@ -170,17 +181,35 @@ def volume_depths(clearance: Clearance, motion: Motion) -> Float[np.ndarray, "fr
     return np.maximum(depth, 0.0)
 
 
-def keep_deepest(
-    clearance: Clearance, motion: Motion, allowed: Float[np.ndarray, "frames pairs"], count: int
-) -> Clearance:
-    """The clearance with the `count` probes of every row only that come deepest in the clip, over `allowed` [m]."""
+def support(
+    clearance: Clearance, motion: Motion, allowed: Float[np.ndarray, "frames pairs"]
+) -> Float[np.ndarray, "sets points"]:
+    """How much each probe has to do with the depth of its pair over the clip: what `reduced` goes by."""
     frames = bucket(motion.frame_count)
     rows = allowed[:, list(clearance.pair_of_row)]
     rows = jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], frames - len(rows), axis=0)]), float)
-    deepest = np.asarray(_over_time(_deepest, clearance.term, padded(motion, frames), rows)).max(axis=0)
-    chosen = np.sort(np.argsort(-deepest, axis=1)[:, :count], axis=1)
-    probes = tuple(p[some] for p, some in zip(clearance.term.probes, chosen, strict=True))
-    return clearance._replace(term=eqx.tree_at(lambda t: t.probes, clearance.term, probes))
+    return np.asarray(_over_time(_support, clearance.term, padded(motion, frames), rows)).sum(axis=0)
+
+
+def reduced(
+    clearance: Clearance, score: Float[np.ndarray, "sets points"], allowed: Float[np.ndarray, "frames pairs"],
+    counts: Mapping[str, int],
+) -> SkinClearance:  # fmt: skip
+    """What the solver works with: of every set the probes of greatest score, one set per field.
+
+    `counts` says how many by kind of part.
+    """
+    term, joined, rows = clearance.term, [], []
+    for k in range(len(term.fields)):
+        sets = [i for i, owner in enumerate(term.field_of) if owner == k]
+        kept = []
+        for i in sets:
+            count = counts[_kind(clearance.part_of_set[i])]
+            kept.append(np.sort(np.argsort(-score[i])[:count]))
+        joined.append(Probes.joined([term.probes[i][some] for i, some in zip(sets, kept, strict=True)]))
+        columns = np.repeat([clearance.pair_of_row[i] for i in sets], [len(some) for some in kept])
+        rows.append(allowed[:, columns])
+    return SkinClearance(tuple(joined), term.fields, tuple(range(len(joined))), tuple(rows), term.sigma, term.width)
 
 
 def allowance(

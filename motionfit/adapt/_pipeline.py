@@ -15,7 +15,7 @@ from motionfit._motion import Motion, bucket, host_kinematics
 from motionfit._onto import onto
 from motionfit._problem import During, Problem, Term
 from motionfit._types import InputError
-from motionfit.adapt._clearance import Clearance, allowance, build_clearance, keep_deepest, volume_depths
+from motionfit.adapt._clearance import Clearance, allowance, build_clearance, reduced, support, volume_depths
 from motionfit.adapt._controls import arm_controls, leg_controls
 from motionfit.metrics import TOLERANCE
 from motionfit.shape.field import standing
@@ -28,7 +28,7 @@ BLOCKS = ("arms", "legs")
 
 SOLVE_RATE = 60.0  # [1/s] frames that the solver looks at; between two of them a limb's depth changes by millimetres
 KNOT_SPACING = 0.1  # [s]
-SOLVE_PROBES = 32  # per row, of the many that are looked at
+SOLVE_PROBES = {"upper_arm": 20, "forearm": 16, "hand": 12, "thigh": 24, "calf": 12}  # per pair, of those looked at
 ALLOWED_EXCESS = 0.007  # [m]
 MARGIN = 0.001  # [m]
 SIGMA_DEPTH = 0.01  # [m]
@@ -101,12 +101,12 @@ def adapt(
             columns = [pairs.index(p) for p in clearance.pairs]
             stages.append(Stage(block, recipe, clearance, allowed[:, columns]))
 
-    correction, history = Correction.zero(seen), []
+    correction, history, result = Correction.zero(seen), [], None
     smooth = _jerk_scale(base)
     total = LOOKS * len(stages)
     padded = dataclasses.replace(base[rows], dt=small.dt)
     for look in range(LOOKS):
-        problem = _problem(character, padded, small, stages, seen, smooth, objective)
+        problem = _problem(character, padded, small, stages, seen, smooth, objective, result and result.motion[np.arange(len(frames))])
         result = fit(problem, [s.block for s in stages], sweeps, correction=correction, progress=None if progress is None
                      else lambda name, done, _, look=look: progress(name, look * len(stages) + done, total))  # fmt: skip
         correction, history = result.correction, history + list(result.history)
@@ -181,18 +181,20 @@ def _jerk_scale(base: Motion) -> float:
     return JERK_SHARE * max(float(jerk.mean()), LEAST_JERK) / LEVER
 
 
-def _problem(character, padded, small, stages, controls, smooth, objective) -> Problem:
+def _problem(character, padded, small, stages, controls, smooth, objective, after) -> Problem:
     real = small.frame_count
     mask = (np.arange(padded.frame_count) < real).astype(float)
     inner = (np.arange(padded.frame_count) < real - 2).astype(float)
     terms: dict[str, Term] = {}
     for stage in stages:
-        allowed = stage.allowed[:, list(stage.clearance.pair_of_row)]
-        far = np.full((padded.frame_count - real, allowed.shape[1]), 1e3)
+        far = np.full((padded.frame_count - real, stage.allowed.shape[1]), 1e3)
+        allowed = np.concatenate([stage.allowed, far])
         clearance = stage.clearance
         if objective == "vertex":
-            clearance = keep_deepest(clearance, small, stage.allowed, SOLVE_PROBES)
-        terms[stage.block.terms[0]] = clearance.allowing(np.concatenate([allowed, far]))
+            score = sum(support(clearance, m, stage.allowed) for m in ((small,) if after is None else (small, after)))
+            terms[stage.block.terms[0]] = reduced(clearance, score, allowed, SOLVE_PROBES)
+        else:
+            terms[stage.block.terms[0]] = clearance.allowing(allowed)
     effort = Effort(np.array([SIGMA_EFFORT[c.name] for c in controls]))
     terms |= {"effort": During(effort, mask), "smoothness": During(Smoothness(smooth), inner)}
     return Problem(character, padded, terms, controls)

@@ -6,14 +6,16 @@ a grid in the bind frame, once per body. A lookup costs a few nanoseconds and ha
 winding numbers of the mesh have none.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
-from scipy.ndimage import spline_filter
+from scipy.ndimage import gaussian_filter1d, spline_filter
 from scipy.spatial.transform import Rotation
 
 from motionfit._character import PARTS, Character
@@ -26,15 +28,14 @@ from motionfit.shape.volumes import bone_tips
 GRID = {"torso": (28, 44, 26)}
 LIMB_GRID = (18, 30, 18)
 MARGIN = 0.03  # [m] of grid around the part
-BLEND_KNOTS = 8
 
 
 class DepthField(eqx.Module):
     """Depth [m] below a part's skin on a grid in the bind frame: positive inside, negative outside.
 
     `coefficients` are those of a quadratic B-spline through the tabulated depths: once continuously differentiable.
-    World points are first taken to the bind pose through the part's `joints`, whose transforms are blended as a
-    function of the height along `axis_bind`, so that a bent trunk is followed.
+    World points are first taken to the bind pose through the part's `joints`. Along `axis_bind` each joint takes over
+    from the one before it between the heights `takeover` [m], so that a bent trunk is followed.
     """
 
     joints: Int[AnyArray, " blended"]
@@ -42,74 +43,76 @@ class DepthField(eqx.Module):
     spacing: Float[AnyArray, "3"]
     coefficients: Float[AnyArray, "nx ny nz"]
     axis_bind: Float[AnyArray, "3"]
-    height_range: Float[AnyArray, "2"]
-    joint_weights: Float[AnyArray, "knots blended"]
+    takeover: Float[AnyArray, "blended-1 2"]
 
-    def depth_bind(self, points_bind: Float[AnyArray, "3 *points"]) -> Float[Array, "*points"]:
-        """Depth [m] of points given in the bind pose, coordinates first."""
-        cells = [
-            (points_bind[a] - jnp.asarray(self.origin_bind)[a]) / jnp.asarray(self.spacing)[a] for a in range(3)
-        ]
-        last = [n - 1.0 for n in self.coefficients.shape]
+    def depth_bind(self, points_bind: Sequence[Float[AnyArray, "*points"]]) -> Float[Array, "*points"]:
+        """Depth [m] of points given in the bind pose, one array per coordinate."""
+        origin, spacing = jnp.asarray(self.origin_bind), jnp.asarray(self.spacing)
+        cells = [(points_bind[a] - origin[a]) / spacing[a] for a in range(3)]
         # half a cell is the spline's reach; outside, the distance to the grid counts as a gap
-        inside = [jnp.clip(c, 0.5, n - 0.5001) for c, n in zip(cells, last, strict=True)]
-        gap = sum(jnp.abs(c - i) * s for c, i, s in zip(cells, inside, jnp.asarray(self.spacing), strict=True))
+        inside = [jnp.clip(c, 0.5, n - 1.5001) for c, n in zip(cells, self.coefficients.shape, strict=True)]
+        gap = sum(jnp.abs(cells[a] - inside[a]) * spacing[a] for a in range(3))
         return _lookup(jnp.asarray(self.coefficients), *inside) - gap
 
-    def to_bind(self, kin: Kinematics, points_world: Float[Array, "3 frames points"]) -> Array:
-        """World points taken into the bind pose of this part, coordinates first."""
+    def to_bind(self, kin: Kinematics, points_world: Float[Array, "3 frames points"]) -> list[Array]:
+        """World points taken into the bind pose of this part, one array per coordinate.
+
+        Written out one component at a time: long contiguous vectors, where a trailing axis of 3 or a sum over a
+        leading one is several times slower on the CPU.
+        """
         chain = jnp.asarray(self.joints)
         turn, shift = kin.skin_rotations[:, chain], kin.skin_translations[:, chain]  # M_j B_j^-1
-        # R^T (p - t), one component at a time: long contiguous vectors, where a trailing axis of 3 would be slow
         moved = []
         for j in range(len(self.joints)):
             gap = [points_world[b] - shift[:, j, b, None] for b in range(3)]
             moved.append([sum(turn[:, j, b, a, None] * gap[b] for b in range(3)) for a in range(3)])
         if len(moved) == 1:
-            return jnp.stack(moved[0])
-        mean = [sum(m[a] for m in moved) / len(moved) for a in range(3)]
-        height = sum(jnp.asarray(self.axis_bind)[a] * mean[a] for a in range(3))
-        low, high = jnp.asarray(self.height_range)
-        place = jnp.clip((height - low) / (high - low), 0.0, 1.0) * (self.joint_weights.shape[0] - 1)
-        bumps = [_bump(place - k) for k in range(self.joint_weights.shape[0])]
-        total = sum(bumps)
-        weights = jnp.asarray(self.joint_weights)
-        shares = [sum(b * weights[k, j] for k, b in enumerate(bumps)) / total for j in range(len(moved))]
-        return jnp.stack([sum(shares[j] * moved[j][a] for j in range(len(moved))) for a in range(3)])
+            return moved[0]
+        axis, heights = jnp.asarray(self.axis_bind), jnp.asarray(self.takeover)
+        height = sum(axis[a] * sum(m[a] for m in moved) / len(moved) for a in range(3))
+        shares = [_smoothstep((height - low) / (high - low)) for low, high in heights]
+        return [
+            moved[0][a] + sum(s * (m[a] - before[a]) for s, before, m in zip(shares, moved, moved[1:], strict=False))
+            for a in range(3)
+        ]
 
     def depth(self, kin: Kinematics, points_world: Float[Array, "3 frames points"]) -> Float[Array, "frames points"]:
         """Depth [m] of world points below the posed part's skin; negative outside."""
         return self.depth_bind(self.to_bind(kin, points_world))
 
 
-def _bump(x):
-    """The quadratic B-spline, 1.5 wide to each side."""
-    far, near = jnp.maximum(1.5 - jnp.abs(x), 0.0), jnp.maximum(0.5 - jnp.abs(x), 0.0)
-    return 0.5 * far * far - 1.5 * near * near
+def _smoothstep(x):
+    x = jnp.clip(x, 0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)
 
 
-def _weights(offset):
+def _cells(shape: tuple[int, ...], point: tuple) -> tuple[list[Array], Array]:
+    """Offsets of grid coordinates from their nearest node, and the flat index of the first of the 27 neighbours."""
+    nodes = [jnp.round(c) for c in point]
+    i, j, k = (n.astype(jnp.int32) - 1 for n in nodes)
+    return [c - n for c, n in zip(point, nodes, strict=True)], (i * shape[1] + j) * shape[2] + k
+
+
+def _weights(offset) -> tuple:
     return 0.5 * (0.5 - offset) ** 2, 0.75 - offset * offset, 0.5 * (0.5 + offset) ** 2
 
 
-def _patches(coefficients, x, y, z):
-    """Per point the offset from the nearest node, and a function that gathers a neighbour's coefficient."""
-    _, ny, nz = coefficients.shape
-    nodes = [jnp.round(c) for c in (x, y, z)]
-    offsets = [c - n for c, n in zip((x, y, z), nodes, strict=True)]
-    i, j, k = (n.astype(jnp.int32) - 1 for n in nodes)
-    base, flat = (i * ny + j) * nz + k, coefficients.reshape(-1)
-    return offsets, lambda a, b, c: flat.at[base + ((a * ny + b) * nz + c)].get(mode="promise_in_bounds")
+def _dot(a, b):
+    return sum(x * y for x, y in zip(a, b, strict=True))
 
 
 @eqx.filter_custom_jvp
 def _lookup(coefficients, x, y, z):
     """Triquadratic B-spline at grid coordinates: 27 neighbours."""
-    offsets, at = _patches(coefficients, x, y, z)
+    _, ny, nz = coefficients.shape
+    offsets, base = _cells(coefficients.shape, (x, y, z))
     wx, wy, wz = (_weights(o) for o in offsets)
-    return sum(
-        wx[a] * wy[b] * sum(wz[c] * at(a, b, c) for c in range(3)) for a in range(3) for b in range(3)
-    )  # fmt: skip
+    flat = coefficients.reshape(-1)
+
+    def column(a, b):
+        return [flat.at[base + ((a * ny + b) * nz + c)].get(mode="promise_in_bounds") for c in range(3)]
+
+    return _dot(wx, [_dot(wy, [_dot(wz, column(a, b)) for b in range(3)]) for a in range(3)])
 
 
 @_lookup.def_jvp
@@ -117,19 +120,22 @@ def _lookup_jvp(primals, tangents):
     """The gradient in closed form, once: every further tangent is then three products per point."""
     coefficients, x, y, z = primals
     t_coefficients, *t_points = tangents
-    offsets, at = _patches(coefficients, x, y, z)
-    weights = [_weights(o) for o in offsets]
-    slopes = [(o - 0.5, -2.0 * o, o + 0.5) for o in offsets]
-    (wx, wy, wz), (sx, sy, sz) = weights, slopes
-    value, gradient = 0.0, [0.0, 0.0, 0.0]
+    _, ny, nz = coefficients.shape
+    offsets, base = _cells(coefficients.shape, (x, y, z))
+    # neither the offsets nor the gradient may be computed anew for each of the tangents
+    offsets, base = jax.lax.optimization_barrier((offsets, base))
+    wx, wy, wz = (_weights(o) for o in offsets)
+    sx, sy, sz = ((o - 0.5, -2.0 * o, o + 0.5) for o in offsets)
+    flat = coefficients.reshape(-1)
+    rows = []
     for a in range(3):
-        for b in range(3):
-            column = [at(a, b, c) for c in range(3)]
-            along = sum(w * v for w, v in zip(wz, column, strict=True))
-            value = value + wx[a] * wy[b] * along
-            gradient[0] = gradient[0] + sx[a] * wy[b] * along
-            gradient[1] = gradient[1] + wx[a] * sy[b] * along
-            gradient[2] = gradient[2] + wx[a] * wy[b] * sum(s * v for s, v in zip(sz, column, strict=True))
+        columns = [
+            [flat.at[base + ((a * ny + b) * nz + c)].get(mode="promise_in_bounds") for c in range(3)] for b in range(3)
+        ]
+        along, steep = [_dot(wz, c) for c in columns], [_dot(sz, c) for c in columns]
+        rows.append((_dot(wy, along), _dot(sy, along), _dot(wy, steep)))
+    level, across, along = zip(*rows, strict=True)
+    value, *gradient = jax.lax.optimization_barrier((_dot(wx, level), _dot(sx, level), _dot(wx, across), _dot(wx, along)))
     tangent = jnp.zeros_like(value)
     for slope, t in zip(gradient, t_points, strict=True):
         if t is not None:
@@ -250,33 +256,36 @@ def fit_field(character: Character, part: str) -> DepthField:
     squared = np.asarray(igl.point_mesh_squared_distance(nodes, vertices, surface.triangles)[0])
     depth = np.sqrt(np.maximum(squared, 0.0)) * np.clip(4.0 * (winding - 0.5), -1.0, 1.0)
     coefficients = spline_filter(depth.reshape(shape), order=2)
-    chain, axis, heights, weights = _blend(character, part, surface.vertices)
-    return DepthField(np.array(chain), low, spacing, coefficients, axis, heights, weights)
+    chain, axis, takeover = _blend(character, part, surface.vertices)
+    return DepthField(np.array(chain), low, spacing, coefficients, axis, takeover)
 
 
-def _blend(character: Character, part: str, mine: np.ndarray) -> tuple:
-    """The joints that carry a part, its axis and range of heights, and the joints' shares at some heights."""
+def _blend(character: Character, part: str, mine: np.ndarray) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:
+    """The joints that carry a part, its axis, and the heights [m] between which each joint takes over."""
     skeleton, skin = character.skeleton, character.skin
     positions, tips = bind_pose(skeleton)[0], bone_tips(skeleton)
-    if part == "torso":
-        chain = (skeleton.joint("hips"), *skeleton.chain("spine"))
-        axis = positions[chain[-1]] - positions[chain[0]]
-    else:
+    if part != "torso":
         joint = skeleton.joint(part)
-        chain, axis = (joint,), tips[joint] - positions[joint]
+        axis = tips[joint] - positions[joint]
+        return (joint,), axis / max(float(np.linalg.norm(axis)), 1e-9), np.zeros((0, 2))
+    chain = (skeleton.joint("hips"), *skeleton.chain("spine"))
+    axis = positions[chain[-1]] - positions[chain[0]]
     axis = axis / max(float(np.linalg.norm(axis)), 1e-9)
     heights = np.asarray(skin.vertices_bind, float)[mine] @ axis
     joints, weights = np.asarray(skin.joints)[mine], np.asarray(skin.weights, float)[mine]
     # skin of clavicles, hip helpers and the like moves with the chain's joint that carries them
     owners = np.array([_owner(skeleton, j, chain) for j in range(len(skeleton.names))])
     shares = np.stack([np.where(owners[joints] == k, weights, 0.0).sum(-1) for k in range(len(chain))], axis=1)
-    low, high = heights.min(), heights.max()
-    place = (heights - low) / (high - low) * (BLEND_KNOTS - 1)
-    basis = np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(BLEND_KNOTS)))
-    bend = np.diff(np.eye(BLEND_KNOTS), 2, axis=0)
-    normal = basis.T @ basis / len(heights) + 1e-4 * bend.T @ bend + 1e-9 * np.eye(BLEND_KNOTS)
-    blend = np.clip(np.linalg.solve(normal, basis.T @ shares / len(heights)), 1e-4, None)
-    return chain, axis, np.array([low, high]), blend / blend.sum(-1, keepdims=True)
+    shares /= np.maximum(shares.sum(-1, keepdims=True), 1e-9)
+    order = np.argsort(heights)
+    takeover = []
+    for k in range(1, len(chain)):
+        # how much of the skin at a height belongs to this joint or a later one, as a rising curve
+        above = np.maximum.accumulate(gaussian_filter1d(shares[order, k:].sum(-1), len(order) / 40))
+        low, high = np.interp((0.2, 0.8), above + 1e-9 * np.arange(len(above)), heights[order])
+        middle, half = (low + high) / 2, max((high - low) / 2 / 0.43, 0.02)  # smoothstep is 0.2 at 0.287, 0.8 at 0.713
+        takeover.append((middle - half, middle + half))
+    return chain, axis, np.array(takeover)
 
 
 def _owner(skeleton: Skeleton, joint: int, chain: tuple[int, ...]) -> int:
@@ -314,6 +323,18 @@ class Probes(eqx.Module):
 
     def __getitem__(self, points: np.ndarray) -> "Probes":
         return Probes(self.joints, self.blend[..., points])
+
+    @classmethod
+    def joined(cls, some: Sequence["Probes"]) -> "Probes":
+        """Several as one, on the joints of all of them."""
+        joints = sorted(set(np.concatenate([p.joints for p in some]).tolist()))
+        blend = np.zeros((len(joints), 4, sum(p.blend.shape[2] for p in some)))
+        start = 0
+        for p in some:
+            stop = start + p.blend.shape[2]
+            blend[[joints.index(j) for j in p.joints.tolist()], :, start:stop] = p.blend
+            start = stop
+        return cls(np.array(joints), blend)
 
 
 def sample_probes(character: Character, part: str, count: int, vertices: np.ndarray | None = None) -> Probes:

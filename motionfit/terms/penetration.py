@@ -84,22 +84,21 @@ class CapsuleClearance(Term):
 
 
 class SkinClearance(Term):
-    """Points of parts' skin against the depth fields of other parts: one row per frame and pair.
+    """Points of parts' skin against the depth fields of other parts: a residual per frame and point.
 
-    The row is the Euclidean norm over the points of their excess depth, so its square is the sum over points.
-    Each pair has its own `probes`; `field_of` names the field that they are tested against. `allowed` [m] is the
-    depth that does not count, per frame and pair. `sigma` [m].
+    Each of the `probes` is tested against the field that `field_of` names. `allowed` [m] is the depth that does not
+    count, per frame and set of probes, or per frame and point. `sigma` [m].
     """
 
     probes: tuple[Probes, ...]
     fields: tuple[DepthField, ...]
     field_of: tuple[int, ...] = eqx.field(static=True)
-    allowed: Float[AnyArray, "*frames pairs"]
+    allowed: tuple[Float[AnyArray, "_ _"], ...]
     sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.01)
     width: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.002)
 
     def point_depths(self, kin: Kinematics) -> list[Float[Array, "frames points"]]:
-        """Depth [m] of every probe per pair; negative outside."""
+        """Depth [m] of every point, set by set; negative outside."""
         points = [p.positions_world(kin) for p in self.probes]
         depths: list[Array] = [jnp.zeros(())] * len(points)
         for k, field in enumerate(self.fields):
@@ -111,14 +110,10 @@ class SkinClearance(Term):
                 depths[i] = depth
         return depths
 
-    def depth(self, kin: Kinematics) -> Float[Array, "frames pairs"]:
-        """Depth [m] of the deepest point of every pair in every frame; negative where all are outside."""
+    def depth(self, kin: Kinematics) -> Float[Array, "frames sets"]:
+        """Depth [m] of the deepest point of every set in every frame; negative where all are outside."""
         return jnp.stack([jnp.max(d, axis=-1) for d in self.point_depths(kin)], axis=-1)
 
-    def residual(self, kin: Kinematics) -> Float[Array, "frames pairs"]:
-        allowed = jnp.asarray(self.allowed)
-        rows = [
-            rotation.safe_norm(hinge(depth - allowed[:, k, None], self.width))
-            for k, depth in enumerate(self.point_depths(kin))
-        ]
-        return jnp.stack(rows, axis=-1) / self.sigma
+    def residual(self, kin: Kinematics) -> Float[Array, "frames points"]:
+        excess = [d - jnp.asarray(a) for d, a in zip(self.point_depths(kin), self.allowed, strict=True)]
+        return hinge(jnp.concatenate(excess, axis=-1), self.width) / self.sigma
