@@ -14,7 +14,15 @@ from motionfit._character import PARTS, Character
 from motionfit._motion import Kinematics, Motion, bucket, forward_kinematics, padded
 from motionfit._skeleton import SIDES
 from motionfit._types import InputError
-from motionfit.shape.field import Probes, fit_field, inside_depths, part_surface, sample_probes
+from motionfit.shape.field import (
+    Probes,
+    fit_field,
+    inside_depths,
+    make_probes,
+    part_surface,
+    sample_vertices,
+    standing_vertices,
+)
 from motionfit.shape.pairs import Pair
 from motionfit.shape.volumes import fit_volumes
 from motionfit.terms.penetration import CapsuleClearance, JointClearance, SkinClearance
@@ -82,11 +90,24 @@ def _of(character: Character, make, *parts: str):
 
 
 def _counted_probes(character: Character, part: str, against: str):
-    """Skin points of a part that lie outside the other part at bind: those inside are the joint itself."""
+    """Skin points of a part that lie outside the other part at bind: those inside are the joint itself.
+
+    A third of them are the deepest ones with the arms hanging, where there are such: the fold of an armpit is small.
+    """
     mine = np.flatnonzero(character.part_of_vertex == PARTS.index(part))
-    surface, vertices = part_surface(character, against), np.asarray(character.skin.vertices_bind, float)
-    outside = inside_depths(vertices[mine], vertices[surface.used], surface.triangles) == 0.0
-    return sample_probes(character, part, PROBE_COUNT, mine[outside] if outside.any() else mine)
+    surface = part_surface(character, against)
+
+    def depths(vertices: np.ndarray) -> np.ndarray:
+        return inside_depths(vertices[mine], vertices[surface.used], surface.triangles)
+
+    outside = depths(np.asarray(character.skin.vertices_bind, float)) == 0.0
+    if not outside.any():
+        outside[:] = True
+    hanging = np.where(outside, depths(standing_vertices(character)), 0.0)
+    fold = np.argsort(-hanging)[: PROBE_COUNT // 3]
+    fold = mine[fold[hanging[fold] > 0.0]]
+    spread = sample_vertices(character, mine[outside], PROBE_COUNT - len(fold), apart_from=fold)
+    return make_probes(character, part, np.concatenate([fold, spread]))
 
 
 def _kind(part: str) -> str:

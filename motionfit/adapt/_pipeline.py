@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from motionfit._character import Character
@@ -17,7 +17,7 @@ from motionfit._problem import During, Problem, Term
 from motionfit._types import InputError
 from motionfit.adapt._clearance import Clearance, allowance, build_clearance, reduced, support, volume_depths
 from motionfit.adapt._controls import arm_controls, leg_controls
-from motionfit.metrics import TOLERANCE
+from motionfit.metrics import TOLERANCE, derivative_ratio, skin_depths
 from motionfit.shape.field import standing
 from motionfit.shape.growth import grow
 from motionfit.shape.pairs import PAIRS, Pair, pairs_of
@@ -29,7 +29,7 @@ BLOCKS = ("arms", "legs")
 SOLVE_RATE = 60.0  # [1/s] frames that the solver looks at; between two of them a limb's depth changes by millimetres
 KNOT_SPACING = 0.1  # [s]
 SOLVE_PROBES = {"upper_arm": 20, "forearm": 16, "hand": 12, "thigh": 20, "calf": 20}  # per pair, of those looked at
-ALLOWED_EXCESS = 0.007  # [m]
+ALLOWED_EXCESS = 0.005  # [m]
 MARGIN = 0.001  # [m]
 SIGMA_DEPTH = 0.01  # [m]
 SIGMA_EFFORT = {
@@ -40,7 +40,9 @@ SIGMA_EFFORT = {
 JERK_SHARE = 1.0  # of the hands' own jerk, what the correction may add at the cost of 1 per frame
 LEVER = 0.5  # [m] shoulder to hand
 LEAST_JERK = 30.0  # [m/s^3] for clips that stand still
-LOOKS = 2
+LOOKS = 4
+MOST_JERK = 1.04
+LEAST_LOOKS, LOOK_SHARE = 10, 1 / 60  # of the frames that the solver sees, looked at on the skin
 
 
 class Stage(NamedTuple):
@@ -51,6 +53,7 @@ class Stage(NamedTuple):
     recipe: str
     clearance: Clearance
     allowed: Float[np.ndarray, "frames pairs"]
+    columns: list[int]
 
 
 def adapt(
@@ -79,13 +82,21 @@ def adapt(
     pairs = everything.pairs
     own, at_ease = _limits(clip, frames, character, reference, pairs, objective)
     before = volume_depths(everything, small)
+    excess = before - own
     # A pair that shows no violation is left alone. What the reference shows standing with its arms hanging is the
     # joint's own overlap, at the armpit above all: measured against the reference frame by frame it would count as
     # excess wherever a clip holds the arms out, as every adapted clip does, and each further adaptation would push
     # them further out.
-    excess = before - own
     quiet = (before - np.maximum(own, at_ease)).max(axis=0) <= TOLERANCE
-    allowed = np.where(quiet, np.maximum(before, own), own + allowance(excess, ALLOWED_EXCESS, MARGIN))
+    skin = None if reference is None or objective != "vertex" else _Skin(clip, frames, character, reference, pairs)
+    beyond = np.zeros_like(own)
+    if skin is not None:
+        seen = skin.depths(small)
+        # near the shoulder the skin knows better than the fields
+        slack = np.array([1.3 if p.adjacent else 1.0 for p in pairs])
+        quiet = skin.quiet(seen) & ((before - np.maximum(own, at_ease)).max(axis=0) <= slack * TOLERANCE)
+        beyond = skin.beyond(seen, excess)
+    allowed = np.where(quiet, np.maximum(before, own), own + allowance(excess + beyond, ALLOWED_EXCESS, MARGIN))
 
     whole = bspline_basis(base.frame_count, float(base.dt), _spacing(basis, small, base))
     controls: list[Control] = []
@@ -93,36 +104,49 @@ def adapt(
         controls += arm_controls(character, base, whole)
     if "legs" in blocks:
         controls += leg_controls(character, base, whole)
-    seen = tuple(_at(c, rows, basis) for c in controls)
+    reduced_controls = tuple(_at(c, rows, basis) for c in controls)
     stages = []
     for recipe in blocks:
         for block, mine in _blocks_of(recipe, pairs):
             clearance = build_clearance(character, mine, objective)
             columns = [pairs.index(p) for p in clearance.pairs]
-            stages.append(Stage(block, recipe, clearance, allowed[:, columns]))
+            stages.append(Stage(block, recipe, clearance, allowed[:, columns], columns))
 
-    correction, history, result = Correction.zero(seen), [], None
+    correction, history, result = Correction.zero(reduced_controls), [], None
     smooth = _jerk_scale(base)
     total = LOOKS * len(stages)
     padded = dataclasses.replace(base[rows], dt=small.dt)
     for look in range(LOOKS):
-        problem = _problem(character, padded, small, stages, seen, smooth, objective, result and result.motion[np.arange(len(frames))])
+        problem = _problem(character, padded, small, stages, beyond, reduced_controls, smooth, objective, result and result.motion[np.arange(len(frames))])
         result = fit(problem, [s.block for s in stages], sweeps, correction=correction, progress=None if progress is None
                      else lambda name, done, _, look=look: progress(name, look * len(stages) + done, total))  # fmt: skip
         correction, history = result.correction, history + list(result.history)
-        after = volume_depths(everything, result.motion[np.arange(len(frames))])
-        over = np.where(quiet, 0.0, after - own)
-        if look == LOOKS - 1 or over.max(initial=0.0) <= TOLERANCE * 0.9:
+        moved = result.motion[np.arange(len(frames))]
+        after = volume_depths(everything, moved)
+        over = after - own
+        if skin is not None:
+            beyond = np.where(quiet, 0.0, skin.beyond(skin.depths(moved), over))
+        over = np.where(quiet, 0.0, over + beyond)
+        if look == LOOKS - 1:
+            break
+        jerk = derivative_ratio(_final(controls, whole, correction).apply(base), base, 3) or 1.0
+        if jerk > MOST_JERK:
+            smooth *= 0.5
+        elif over.max(initial=0.0) <= TOLERANCE * 0.8:
             break
         # the solver looks at some points only, and its corrections are smooth: what is still seen is taken off
-        stages = [_tighten(s, over[:, [pairs.index(p) for p in s.clearance.pairs]], float(small.dt)) for s in stages]
-    final = Correction(tuple(controls), tuple(np.asarray(p)[: whole.count] for p in correction.points))
+        stages = [_tighten(s, over[:, s.columns], float(small.dt)) for s in stages]
+    final = _final(controls, whole, correction)
     motion = final.apply(base)
-    left = (after - own)[:, ~quiet].max(initial=0.0)
-    status = "violations_left" if left > TOLERANCE else "converged"
+    status = "violations_left" if over.max(initial=0.0) > TOLERANCE else "converged"
     details = {"pairs": [p.name for p in pairs], "frames": frames, "excess_before_m": before - own,
                "excess_after_m": after - own}  # fmt: skip
     return Fit(final, motion, base, status, tuple(history), result.problem, details)
+
+
+def _final(controls: Sequence[Control], basis: Basis, correction: Correction) -> Correction:
+    """The correction of the whole clip: its controls in every frame, and the control points that they need."""
+    return Correction(tuple(controls), tuple(np.asarray(p)[: basis.count] for p in correction.points))
 
 
 def _solve_frames(base: Motion) -> Int[np.ndarray, " seen"]:
@@ -173,6 +197,35 @@ def _limits(clip, frames, character, reference, pairs, objective):
     return depths[:-1], depths[-1] * adjacent
 
 
+class _Skin:
+    """Looks at the skinned mesh itself, at some frames of a clip: what the fields cannot tell near the shoulder.
+
+    There the skin follows arm and trunk at once, and the fold of the joint is not where a table of one pose says.
+    """
+
+    def __init__(self, clip: Motion, frames: np.ndarray, character: Character, reference: Character, pairs):
+        count = min(len(frames), max(LEAST_LOOKS, round(len(frames) * LOOK_SHARE)))
+        self.at = np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))
+        self.frames, self.character, self.pairs = np.arange(len(frames)), character, pairs
+        self.own = skin_depths(reference, onto(clip[frames[self.at]], reference.skeleton), pairs).depth
+        adjacent = np.array([p.adjacent for p in pairs])
+        self.at_ease = skin_depths(reference, standing(reference.skeleton), pairs).depth[0] * adjacent
+
+    def depths(self, motion: Motion) -> Float[np.ndarray, "looks pairs"]:
+        return skin_depths(self.character, motion[self.at], self.pairs).depth
+
+    def quiet(self, seen: Float[np.ndarray, "looks pairs"]) -> Bool[np.ndarray, " pairs"]:
+        return (seen - np.maximum(self.own, self.at_ease)).max(axis=0) <= TOLERANCE
+
+    def beyond(
+        self, seen: Float[np.ndarray, "looks pairs"], excess: Float[np.ndarray, "frames pairs"]
+    ) -> Float[np.ndarray, "frames pairs"]:
+        """How much more excess [m] the skin shows than the fields, where it shows any; between looks interpolated."""
+        more = np.where(seen > 0, seen - self.own - excess[self.at], 0.0)
+        more = np.clip(more, 0.0, 0.05)
+        return np.stack([np.interp(self.frames, self.at, column) for column in more.T], axis=1)
+
+
 def _jerk_scale(base: Motion) -> float:
     """[rad/s^3] that adds as much jerk at the hand as the clip has itself."""
     positions = host_kinematics(base)[0][:, [base.skeleton.joint(f"{s}_hand") for s in ("left", "right")]]
@@ -181,14 +234,14 @@ def _jerk_scale(base: Motion) -> float:
     return JERK_SHARE * max(float(jerk.mean()), LEAST_JERK) / LEVER
 
 
-def _problem(character, padded, small, stages, controls, smooth, objective, after) -> Problem:
+def _problem(character, padded, small, stages, beyond, controls, smooth, objective, after) -> Problem:
     real = small.frame_count
     mask = (np.arange(padded.frame_count) < real).astype(float)
     inner = (np.arange(padded.frame_count) < real - 2).astype(float)
     terms: dict[str, Term] = {}
     for stage in stages:
         far = np.full((padded.frame_count - real, stage.allowed.shape[1]), 1e3)
-        allowed = np.concatenate([stage.allowed, far])
+        allowed = np.concatenate([stage.allowed - beyond[:, stage.columns], far])
         clearance = stage.clearance
         if objective == "vertex":
             score = sum(support(clearance, m, stage.allowed) for m in ((small,) if after is None else (small, after)))

@@ -389,32 +389,30 @@ class Probes(eqx.Module):
         return cls(np.array(joints), blend)
 
 
-def sample_probes(character: Character, part: str, count: int, vertices: np.ndarray | None = None) -> Probes:
-    """`count` vertices of the part by farthest-point sampling, among `vertices` where given.
-
-    A part with fewer repeats its last one, so that every body has the same number of points.
-    """
-    skin, skeleton = character.skin, character.skeleton
-    mine = np.flatnonzero(character.part_of_vertex == PARTS.index(part)) if vertices is None else vertices
-    if len(mine) == 0:
-        raise InputError(
-            f"{character.name}: part {part!r} has no vertices; check the skin weights and the role mapping"
-        )
-    points = np.asarray(skin.vertices_bind, float)[mine]
-    chosen = [int(np.argmin(points @ np.array([0.3, 1.0, 0.2])))]
+def sample_vertices(
+    character: Character, among: Int[np.ndarray, " some"], count: int, apart_from: Int[np.ndarray, " known"]
+) -> Int[np.ndarray, " count"]:
+    """`count` vertices by farthest-point sampling, `apart_from` others; the last is repeated where there are fewer, so
+    that every body has the same number."""
+    points, known = np.asarray(character.skin.vertices_bind, float)[among], list(apart_from)
     distance = np.full(len(points), np.inf)
+    for vertex in known:
+        distance = np.minimum(distance, ((points - np.asarray(character.skin.vertices_bind, float)[vertex]) ** 2).sum(-1))
+    chosen = [int(distance.argmax()) if known else int(np.argmin(points @ np.array([0.3, 1.0, 0.2])))]
     for _ in range(min(count, len(points)) - 1):
         distance = np.minimum(distance, ((points - points[chosen[-1]]) ** 2).sum(-1))
         chosen.append(int(distance.argmax()))
-    chosen += [chosen[-1]] * (count - len(chosen))
-    carrying = carrying_joints(skeleton, part)
-    weights = np.zeros((len(carrying), count))
-    for column, vertex in enumerate(mine[chosen]):
-        for joint, weight in zip(np.asarray(skin.joints)[vertex], np.asarray(skin.weights, float)[vertex], strict=True):
-            if joint in carrying:
-                weights[carrying.index(joint), column] += weight
+    return among[chosen + [chosen[-1]] * (count - len(chosen))]
+
+
+def make_probes(character: Character, part: str, vertices: Int[np.ndarray, " points"]) -> Probes:
+    """Probes at some vertices of a part."""
+    skin, carrying = character.skin, carrying_joints(character.skeleton, part)
+    joints, shares = np.asarray(skin.joints)[vertices], np.asarray(skin.weights, float)[vertices]
+    weights = np.stack([np.where(joints == j, shares, 0.0).sum(-1) for j in carrying])
     weights /= np.maximum(weights.sum(0), 1e-9)
-    homogeneous = np.concatenate([points[chosen].T, np.ones((1, count))])
+    points = np.asarray(skin.vertices_bind, float)[vertices]
+    homogeneous = np.concatenate([points.T, np.ones((1, len(vertices)))])
     return Probes(np.array(carrying), weights[:, None] * homogeneous[None])
 
 
