@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from motionfit._character import Character
 from motionfit._control import Control, Correction
 from motionfit._fit import Block, BlockReport, Fit, fit
-from motionfit._motion import Motion, bucket, host_kinematics
+from motionfit._motion import Motion, bucket, host_kinematics, rest_motion
 from motionfit._onto import onto
 from motionfit._problem import During, Problem, Term
 from motionfit._types import InputError
@@ -33,15 +33,16 @@ ALLOWED_EXCESS = 0.005  # [m]
 MARGIN = 0.001  # [m]
 SIGMA_DEPTH = 0.01  # [m]
 SIGMA_EFFORT = {
-    "left_arm": 1.0, "left_arm_across": 1.0, "left_arm_twist": 1.0,
-    "right_arm": 1.0, "right_arm_across": 1.0, "right_arm_twist": 1.0,
+    "left_arm": 1.0, "left_arm_across": 1.0, "left_arm_twist": 0.4,
+    "right_arm": 1.0, "right_arm_across": 1.0, "right_arm_twist": 0.4,
     "hip_turn": 0.1, "thighs_apart": 1.0,
 }  # [rad]  # fmt: skip
 JERK_SHARE = 1.0  # of the hands' own jerk, what the correction may add at the cost of 1 per frame
 LEVER = 0.5  # [m] shoulder to hand
 LEAST_JERK = 30.0  # [m/s^3] for clips that stand still
-LOOKS = 4
+LOOKS = 6
 MOST_JERK = 1.04
+SHOULDER_SLACK = 1.15
 LEAST_LOOKS, LOOK_SHARE = 10, 1 / 60  # of the frames that the solver sees, looked at on the skin
 
 
@@ -93,10 +94,14 @@ def adapt(
     if skin is not None:
         seen = skin.depths(small)
         # near the shoulder the skin knows better than the fields
-        slack = np.array([1.3 if p.adjacent else 1.0 for p in pairs])
+        slack = np.array([2.0 if p.first.endswith("upper_arm") else 1.0 for p in pairs])
         quiet = skin.quiet(seen) & ((before - np.maximum(own, at_ease)).max(axis=0) <= slack * TOLERANCE)
-        beyond = skin.beyond(seen, excess)
-    allowed = np.where(quiet, np.maximum(before, own), own + allowance(excess + beyond, ALLOWED_EXCESS, MARGIN))
+        beyond = np.where(quiet, 0.0, skin.beyond(seen, excess))
+    kept = own + allowance(excess + beyond, ALLOWED_EXCESS, MARGIN)
+    # parts that do not meet at a joint may touch as on the reference, but on an adapted clip the reference no longer
+    # does: what is kept must pass for no violation then either
+    kept = np.where([p.adjacent for p in pairs], kept, np.maximum(own, np.minimum(kept, 0.8 * TOLERANCE)))
+    allowed = np.where(quiet, np.maximum(before, own), kept)
 
     whole = bspline_basis(base.frame_count, float(base.dt), _spacing(basis, small, base))
     controls: list[Control] = []
@@ -123,6 +128,7 @@ def adapt(
         correction, history = result.correction, history + list(result.history)
         moved = result.motion[np.arange(len(frames))]
         after = volume_depths(everything, moved)
+        used = {s.block.name: s.allowed - beyond[:, s.columns] for s in stages}
         over = after - own
         if skin is not None:
             beyond = np.where(quiet, 0.0, skin.beyond(skin.depths(moved), over))
@@ -134,8 +140,13 @@ def adapt(
             smooth *= 0.5
         elif over.max(initial=0.0) <= TOLERANCE * 0.8:
             break
+        if over.max(initial=0.0) <= TOLERANCE * 0.8:
+            continue
         # the solver looks at some points only, and its corrections are smooth: what is still seen is taken off
-        stages = [_tighten(s, over[:, s.columns], float(small.dt)) for s in stages]
+        stages = [
+            _tighten(s, np.where(over > 0.7 * TOLERANCE, after, 0.0)[:, s.columns] - used[s.block.name], float(small.dt))
+            for s in stages
+        ]
     final = _final(controls, whole, correction)
     motion = final.apply(base)
     status = "violations_left" if over.max(initial=0.0) > TOLERANCE else "converged"
@@ -184,17 +195,22 @@ def _limits(clip, frames, character, reference, pairs, objective):
     """Depth [m] that does not count, per frame and pair, and that of the joint itself, per pair."""
     body = reference or character
     clearance = build_clearance(body, pairs, objective)
-    still = standing(body.skeleton)
-    adjacent = np.array([p.adjacent for p in pairs])
     if reference is None:
-        from motionfit._motion import rest_motion
         rest = volume_depths(clearance, rest_motion(body.skeleton))
         return np.tile(rest, (len(frames), 1)), np.zeros(len(pairs))
-    moving = onto(clip[frames], body.skeleton)
-    both = Motion(body.skeleton, np.concatenate([moving.root, still.root]),
-                  np.concatenate([moving.rotations, still.rotations]), moving.dt)  # fmt: skip
+    moving, easy = onto(clip[frames], body.skeleton), _at_ease(body)
+    both = Motion(body.skeleton, np.concatenate([moving.root, easy.root]),
+                  np.concatenate([moving.rotations, easy.rotations]), moving.dt)  # fmt: skip
     depths = volume_depths(clearance, both)
-    return depths[:-1], depths[-1] * adjacent
+    count = len(moving.root)
+    return depths[:count], depths[count:].max(axis=0) * np.array([p.adjacent for p in pairs])
+
+
+def _at_ease(body: Character) -> Motion:
+    """Standing with the arms hanging, and swung as in a walk."""
+    poses = [standing(body.skeleton, swing) for swing in (-0.35, 0.0, 0.35)]
+    return Motion(body.skeleton, np.concatenate([p.root for p in poses]),
+                  np.concatenate([p.rotations for p in poses]), poses[0].dt)  # fmt: skip
 
 
 class _Skin:
@@ -209,13 +225,16 @@ class _Skin:
         self.frames, self.character, self.pairs = np.arange(len(frames)), character, pairs
         self.own = skin_depths(reference, onto(clip[frames[self.at]], reference.skeleton), pairs).depth
         adjacent = np.array([p.adjacent for p in pairs])
-        self.at_ease = skin_depths(reference, standing(reference.skeleton), pairs).depth[0] * adjacent
+        if ("skin at ease", pairs) not in reference.memo:
+            reference.memo["skin at ease", pairs] = skin_depths(reference, _at_ease(reference), pairs).depth.max(axis=0)
+        self.at_ease = reference.memo["skin at ease", pairs] * adjacent
 
     def depths(self, motion: Motion) -> Float[np.ndarray, "looks pairs"]:
         return skin_depths(self.character, motion[self.at], self.pairs).depth
 
     def quiet(self, seen: Float[np.ndarray, "looks pairs"]) -> Bool[np.ndarray, " pairs"]:
-        return (seen - np.maximum(self.own, self.at_ease)).max(axis=0) <= TOLERANCE
+        slack = np.array([SHOULDER_SLACK if p.first.endswith("upper_arm") else 1.0 for p in self.pairs])
+        return (seen - np.maximum(self.own, self.at_ease)).max(axis=0) <= slack * TOLERANCE
 
     def beyond(
         self, seen: Float[np.ndarray, "looks pairs"], excess: Float[np.ndarray, "frames pairs"]
@@ -254,11 +273,11 @@ def _problem(character, padded, small, stages, beyond, controls, smooth, objecti
 
 
 def _tighten(stage: Stage, over: Float[np.ndarray, "frames pairs"], dt: float) -> Stage:
-    """Less may stay where more than the tolerance is still seen: per pair, around the frames that show it."""
-    more = np.where(over > TOLERANCE * 0.8, over - ALLOWED_EXCESS, 0.0)
+    """Less may stay where the solve left more [m] than it was allowed: per pair, around the frames that show it."""
+    more = np.where(over > 0.001, over, 0.0)
     width = max(1, round(0.1 / dt))
     more = gaussian_filter1d(maximum_filter1d(more, 2 * width + 1, axis=0), width / 2, axis=0, mode="nearest")
-    return stage._replace(allowed=stage.allowed - 1.3 * more)
+    return stage._replace(allowed=stage.allowed - np.minimum(1.3 * more, 0.02))
 
 
 def arms(clip: Motion, character: Character, **options) -> Fit:

@@ -224,8 +224,9 @@ def inside_depths(
     return depth
 
 
-def standing(skeleton: Skeleton) -> Motion:
-    """One frame of standing with the arms hanging 2 degrees from the vertical and straight, all else at bind."""
+def standing(skeleton: Skeleton, swing: float = 0.0) -> Motion:
+    """One frame of standing with the arms hanging 2 degrees from the vertical and straight, all else at bind; both
+    arms `swing` [rad] to the front."""
     rest = rest_motion(skeleton)
     positions, world = bind_pose(skeleton)
     rotations = np.array(rest.rotations, float)
@@ -236,7 +237,8 @@ def standing(skeleton: Skeleton) -> Motion:
             continue
         arm, elbow, hand = chain
         sign = np.sign(positions[arm][0] - positions[skeleton.joint("chest")][0])
-        down = np.array([sign * np.sin(np.deg2rad(2)), -np.cos(np.deg2rad(2)), 0.0])
+        out, forth = np.deg2rad(2), swing
+        down = np.array([sign * np.sin(out), -np.cos(out) * np.cos(forth), np.cos(out) * np.sin(forth)])
         for joint, end in ((arm, elbow), (elbow, hand)):
             bone = positions[end] - positions[joint]
             laid, _ = Rotation.align_vectors(down[None], (bone / np.linalg.norm(bone))[None])
