@@ -15,9 +15,11 @@ import mujoco
 import numpy as np
 import qpsolvers
 
-ITERATIONS = 5  # quadratic programs per frame; one alone lags behind the clip
+ITERATIONS = 3  # quadratic programs per frame; one alone lags behind the clip
+GAIN = 0.7  # of the pull to the clip's pose; a full step overshoots where a pair holds it back, and chatters
 WARM_UP = 100  # for the first frame, which comes from the bind pose
-MARGIN = 0.002  # [m] a pair that is too close is pushed apart by that much per iteration
+
+MARGIN = 0.0005  # [m] a pair that is too close is pushed apart by that much per iteration
 
 
 def model_of(work) -> tuple[mujoco.MjModel, list[str]]:
@@ -55,7 +57,10 @@ def main() -> None:
     model, capsules = model_of(work)
     order = np.array([model.joint(f"j{k}").qposadr[0] for k in range(len(work["parents"]))])
     places = (order[:, None] + np.arange(4)).ravel()
-    frames, dt = len(work["rotations"]), float(work["dt"])
+    frames = len(work["rotations"])
+    # mink bounds the step of one QP by (distance / dt); with the clip's dt that is sixty times the distance, and poses
+    # jump through each other. In units of one step both sides are the same.
+    dt = 1.0
 
     def pose(rotations):
         q = np.empty(model.nq)
@@ -65,14 +70,14 @@ def main() -> None:
     limits, rows = [], []
     for row, (a, b) in enumerate(zip(work["first"], work["second"], strict=True)):
         limit = mink.CollisionAvoidanceLimit(
-            model, [([capsules[a]], [capsules[b]])], collision_detection_distance=0.05, bound_relaxation=-MARGIN / dt
+            model, [([capsules[a]], [capsules[b]])], collision_detection_distance=0.05, bound_relaxation=-MARGIN
         )
         if limit.max_num_contacts:  # mink leaves out neighbours in the tree
             limits.append(limit)
             rows.append(row)
     solver = "daqp" if "daqp" in qpsolvers.available_solvers else qpsolvers.available_solvers[0]
     configuration = mink.Configuration(model, q=pose(work["rest_rotations"]))
-    task = mink.PostureTask(model, cost=1.0)
+    task = mink.PostureTask(model, cost=1.0, gain=GAIN)
     made, infeasible = np.empty_like(work["rotations"]), 0
 
     def frame(t: int, iterations: int) -> None:

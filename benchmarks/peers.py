@@ -74,15 +74,18 @@ class Judged:
     over_1cm: float
     deviation_rad: float
     jerk_ratio: float
+    pairs_left: str
     note: str
 
 
 def judge(name: str, work: Work, motion: mf.Motion, frame_s: float, fk_frame_s: float, note: str) -> Judged:
     """Penetration left and closeness to the source, by the same measures for all."""
     excess = work.excess(motion)
+    left = [p.name for p, worst in zip(work.clearance.pairs, excess.max(axis=0), strict=True) if worst > TOLERANCE]
     return Judged(
         name, frame_s, fk_frame_s, float(excess.max()), float((excess > TOLERANCE).any(1).mean()),
-        joint_angle_deviation(motion, work.motion)[0], derivative_ratio(motion, work.motion, 3), note,
+        joint_angle_deviation(motion, work.motion)[0], derivative_ratio(motion, work.motion, 3),
+        ", ".join(left) if len(left) <= 4 else f"{len(left)} pairs", note,
     )  # fmt: skip
 
 
@@ -152,10 +155,10 @@ def _interpreter(name: str) -> str:
 def table(rows: list[Judged]) -> str:
     """The comparison in markdown."""
     lines = ["| library | ms/frame | FK ms/frame | worst excess [cm] | frames over 1 cm | deviation [rad] | jerk ratio "
-             "| note |", "|---" * 8 + "|"]  # fmt: skip
+             "| pairs over 1 cm | note |", "|---" * 9 + "|"]  # fmt: skip
     for r in rows:
         lines.append(f"| {r.name} | {1e3 * r.frame_s:.4g} | {1e3 * r.fk_frame_s:.3g} | {100 * r.worst_m:.2f} "
-                     f"| {r.over_1cm:.1%} | {r.deviation_rad:.4f} | {r.jerk_ratio:.3g} | {r.note} |")  # fmt: skip
+                     f"| {r.over_1cm:.1%} | {r.deviation_rad:.4f} | {r.jerk_ratio:.3g} | {r.pairs_left} | {r.note} |")  # fmt: skip
     return "\n".join(lines)
 
 
