@@ -347,12 +347,12 @@ def _metrics(key: str, outcomes: list[Outcome], tolerance: float) -> Iterator[Me
     print(table(outcomes), flush=True)
     for frames in sorted({o.frames for o in outcomes}):
         rows = {o.name: o for o in outcomes if o.frames == frames and not o.skipped}
-        best, base = best_cost(outcomes, frames), rows.get("lm-banded", rows["lm-cholesky"])
+        best, base = best_cost(outcomes, frames), rows.get("lm-banded", rows.get("lm-cholesky"))
         for name, o in rows.items():
             yield seconds(f"{key}.{name}_{frames}", o.time_s)
             if not o.capped:
                 yield Metric(f"{key}.{name}_{frames}_cost_over_best", o.cost / best, "ratio", "lower", 0.0, 1e-3)
-            if o is not base:
+            if base is not None and o is not base:
                 gated = None if o.capped else tolerance
                 yield Metric(f"{key}.{base.name}_over_{name}_{frames}", base.time_s / o.time_s, "ratio", "lower",
                              gated, 0.0, True)  # fmt: skip

@@ -15,7 +15,6 @@ import numpy as np
 import pymomentum.geometry as geometry
 import pymomentum.solver2 as solver
 
-
 ITERATIONS = 20
 
 COLLISION = 1.0  # momentum's own weighting; ten times more is no clearer of overlaps and leaves the motion jerky
