@@ -140,7 +140,7 @@ def _against(walk: mf.Motion, name: str, ours: Callable, naive: Callable) -> Ite
     yield seconds(f"{name}.run_naive", pace.reference_s, "ms")
     yield time_ratio(f"{name}.run_over_naive", pace.ratio)
     yield seconds(f"{name}.compile", compiling[0])
-    yield time_ratio(f"{name}.compile_over_naive", compiling[0] / compiling[1])
+    yield time_ratio(f"{name}.compile_over_naive", compiling[0] / compiling[1], 1.5)
 
 
 def skin(frames: int = FRAMES) -> Iterator[Metric]:
@@ -170,7 +170,7 @@ def skin(frames: int = FRAMES) -> Iterator[Metric]:
     yield Metric("skin.error", float(error), "m", "lower", 0.1, 5e-6)
     pace = interleaved(lambda: ours(mesh, walk), in_numpy, rounds=9)
     yield seconds("skin.run", pace.run_s / frames, "us/frame")
-    yield time_ratio("skin.run_over_numpy", pace.ratio * len(positions) / frames)
+    yield time_ratio("skin.run_over_numpy", pace.ratio * len(positions) / frames, 1.0)
 
 
 def _with_joints(skeleton: mf.Skeleton, motion: mf.Motion, joints: int) -> tuple[mf.Skeleton, mf.Motion]:
@@ -214,7 +214,7 @@ def joints(counts: tuple[int, ...] = (31, 124, 496)) -> Iterator[Metric]:
         pace = interleaved(works[count], works[first])
         yield seconds(f"joints.run_{count}", pace.run_s, "ms")
         yield time_ratio(f"joints.run_per_joint_{count}_over_{first}", pace.ratio * first / count)
-        yield time_ratio(f"joints.compile_{count}_over_{first}", compiling[count] / compiling[first], 1.0)
+        yield time_ratio(f"joints.compile_{count}_over_{first}", compiling[count] / compiling[first], 1.5)
 
 
 # --- adaptation ------------------------------------------------------------------------------------------------
@@ -228,8 +228,8 @@ def block(name: str, frames: int = FRAMES) -> Iterator[Metric]:
     fit = run()
     first_s = time.perf_counter() - start
     key = f"block-{name}"
-    last = fit.history[-1]
-    yield Metric(f"{key}.cost", last.cost_after, "1", "lower", 0.01)
+    last = {b.name: b for b in fit.history}  # a recipe may have several blocks (one per arm), and look at them twice
+    yield Metric(f"{key}.cost", sum(b.cost_after for b in last.values()), "1", "lower", 0.01)
     yield Metric(f"{key}.excess_left", _left(fit), "m", "lower", 0.05, 2e-4)
     yield Metric(f"{key}.steps", sum(b.accepted_steps for b in fit.history), "steps", "lower", 0.25, 2)
     solves = []
@@ -242,7 +242,7 @@ def block(name: str, frames: int = FRAMES) -> Iterator[Metric]:
     yield seconds(f"{key}.solve", float(np.median(solves)) / frames, "ms/frame")
     yield time_ratio(f"{key}.run_over_fixed", pace.ratio)
     yield seconds(f"{key}.compile", first_s - pace.run_s)
-    yield time_ratio(f"{key}.compile_over_fixed", (first_s - pace.run_s) / compile_reference(), 1.0)
+    yield time_ratio(f"{key}.compile_over_fixed", (first_s - pace.run_s) / compile_reference(), 1.5)
 
 
 def _left(fit: mf.Fit) -> float:
@@ -268,7 +268,7 @@ def adaptation(frames: int = FRAMES) -> Iterator[Metric]:
     yield seconds("adapt.run", pace.run_s / frames, "ms/frame")
     yield time_ratio("adapt.run_over_fixed", pace.ratio)
     yield seconds("adapt.compile", first_s - pace.run_s)
-    yield time_ratio("adapt.compile_over_fixed", (first_s - pace.run_s) / compile_reference(), 1.0)
+    yield time_ratio("adapt.compile_over_fixed", (first_s - pace.run_s) / compile_reference(), 1.5)
     girth = grow(heavy, {"arms": 1.1})
     yield Metric("adapt.compilations_other_girth", compilations(lambda: run(walk, girth)), "programs", "lower", 0.0)
     # a few frames less: still in the same length bucket
@@ -306,7 +306,7 @@ def joints_adapt(counts: tuple[int, ...] = (31, 124), frame_count: int = FRAMES)
         works[count] = functools.partial(mf.adapt, motion, characters[0], reference=characters[1])
         fits[count] = works[count]()
     few, many = counts[0], counts[-1]
-    costs = [fits[k].history[-1].cost_after for k in (many, few)]
+    costs = [sum({b.name: b.cost_after for b in fits[k].history}.values()) for k in (many, few)]
     yield Metric("joints-adapt.cost_over_few", costs[0] / costs[1], "ratio", "equal", 0.01)
     pace = interleaved(works[many], works[few], rounds=5)
     yield seconds("joints-adapt.run", pace.run_s / frame_count, "ms/frame")
