@@ -318,6 +318,8 @@ def plot(outcomes: list[Outcome], folder: pathlib.Path) -> None:
 
     traced = [o for o in outcomes if len(o.trace) > 1]
     frames = max((o.frames for o in traced if o.name.startswith("lm-")), default=0)
+    if not frames:  # no length was traced
+        return
     figure, axes = plt.subplots(figsize=(7, 5))
     best = best_cost(outcomes, frames)
     for o in traced:
