@@ -1,10 +1,12 @@
 """Random skeletons and motions, and independent oracles."""
 
+import equinox as eqx
 import numpy as np
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from motionfit import Motion, Skeleton
+from motionfit import Character, Motion, Skeleton, Skin
+from motionfit._motion import bind_pose
 
 
 def random_motion(seed: int, joints: int, frames: int, rate: float = 60.0) -> Motion:
@@ -44,3 +46,20 @@ def central_difference(fn, x: np.ndarray, step: float = 1e-6) -> np.ndarray:
         down[i] -= step
         gradient[i] = (float(fn(up)) - float(fn(down))) / (2 * step)
     return gradient
+
+
+def with_legs(character: Character, scale: float) -> Character:
+    """The character with thighs and calves `scale` times as long, standing on the same floor."""
+    skeleton, skin = character.skeleton, character.skin
+    old = bind_pose(skeleton)[0]
+    offsets = np.array(skeleton.offsets, float)
+    for side in ("left", "right"):
+        for role in ("calf", "foot"):
+            offsets[skeleton.joint(f"{side}_{role}")] *= scale
+    longer = eqx.tree_at(lambda s: s.offsets, skeleton, offsets)
+    foot = skeleton.joint("left_foot")
+    offsets[0, 1] += old[foot, 1] - bind_pose(longer)[0][foot, 1]
+    longer = eqx.tree_at(lambda s: s.offsets, skeleton, offsets)
+    shift = bind_pose(longer)[0] - old
+    moved = np.asarray(skin.vertices_bind) + np.einsum("vk,vka->va", skin.weights, shift[np.asarray(skin.joints)])
+    return Character(longer, Skin(moved, skin.faces, skin.joints, skin.weights), f"{character.name} legs {scale:g}")

@@ -1,0 +1,23 @@
+"""Feet on the ground: the floor, the sole, when a foot is down, and how to make it hold still.
+
+    plants = mf.detect_footplants(clip, body)          # which foot, which vertex, how sure; flight and both feet too
+    clean = mf.remove_footskate(clip, body)            # clean.motion: no joint is turned, only the root moves
+
+The sources are Lyard & Magnenat Thalmann 2007 with chapter 3 of Lyard's thesis (2008), and Glardon, Boulic &
+Thalmann 2006.
+"""
+
+from motionfit.feet._detect import Evidence, detect, gather
+from motionfit.feet._floor import Floor, fit_floor
+from motionfit.feet._plants import Footplants, Plant, load_labels, save_labels
+from motionfit.feet._remove import METHODS, FootFit, measure_feet
+from motionfit.feet._root import frame_heights, horizontal_path, root_steps, scaled_heights, vertical_scale
+from motionfit.feet._sole import Sole, find_sole, sole_paths
+from motionfit.feet._transfer import catmull_rom, cubic_roots, place_at, transfer_instant
+
+__all__ = [
+    "Evidence", "Floor", "FootFit", "Footplants", "METHODS", "Plant", "Sole", "catmull_rom", "cubic_roots", "detect",
+    "find_sole", "fit_floor", "frame_heights", "gather", "horizontal_path", "load_labels",
+    "measure_feet", "place_at", "root_steps", "save_labels", "scaled_heights", "sole_paths",
+    "transfer_instant", "vertical_scale",
+]  # fmt: skip
