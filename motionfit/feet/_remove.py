@@ -13,7 +13,9 @@ from motionfit._onto import onto
 from motionfit._skeleton import SIDES
 from motionfit._types import InputError
 from motionfit.feet._detect import assemble, detect, gather
+from motionfit.feet._enforce import enforce
 from motionfit.feet._floor import Floor
+from motionfit.feet._leg import with_leg_ik
 from motionfit.feet._plants import Footplants, Plant, load_labels
 from motionfit.feet._root import frame_heights, horizontal_path, scaled_heights
 from motionfit.feet._sole import Sole, find_sole, sole_paths
@@ -171,7 +173,7 @@ def remove_footskate(
     labels: str | os.PathLike | tuple[Plant, ...] | None = None,
     floor: Floor | float | None = None,
     vertical: str = "scale",
-    lift: float = 0.0,
+    lift: float | None = None,
 ) -> FootFit:
     """A motion whose planted feet hold still.
 
@@ -183,8 +185,8 @@ def remove_footskate(
     `plants` or `labels` (a CSV file) say when feet are down, else `detect_footplants` does. `floor` is where the
     feet shall stand (a height [m] or a `Floor`); without it they stay on the floor that the clip's contacts show.
     `vertical` is how the root method treats heights: "scale" (an offset and a scale for the whole clip), "frame"
-    (Emering's correction of each frame) or "none". `lift` [m] lowers the character a little before the legs are
-    bent, so that they need not stretch (thesis 5.5.1).
+    (Emering's correction of each frame) or "none". `lift` [m] lowers the character by that much before the legs are
+    bent, so that they need not stretch (thesis 5.5.1); without it, only where and as far as a leg is too short.
 
         clean = mf.remove_footskate(clip, body)
         clean.motion, clean.status, clean.report()
@@ -193,7 +195,7 @@ def remove_footskate(
         raise InputError(f"unknown method {method!r}; methods: {', '.join(METHODS)}")
     if vertical not in VERTICALS:
         raise InputError(f"unknown vertical correction {vertical!r}; there are {', '.join(VERTICALS)}")
-    if not 0.0 <= lift <= 0.2:
+    if lift is not None and not 0.0 <= lift <= 0.2:
         raise InputError(f"a lift from 0 to 0.2 m is allowed, got {lift:g}")
     base = onto(motion, character.skeleton)
     if plants is not None:
@@ -204,14 +206,22 @@ def remove_footskate(
         speed = gather(sole, base, plants.floor).speed
     else:
         plants, sole, speed = _plants(base, character, None, labels)
-    target = _as_floor(floor)
-    return _root(base, sole, plants, speed, target, vertical)
+    target, paths, rows = _as_floor(floor), sole_paths(sole, base), rows_of(sole, plants.vertex)
+    if method == "root":
+        result, details = _root(base, sole, plants, paths, rows, speed, target, vertical)
+        reachable = np.ones_like(plants.planted)
+    elif method == "leg-ik":
+        result, reachable, details = with_leg_ik(base, sole, plants, paths, rows, speed, target, lift)
+    else:
+        result, reachable, details = enforce(base, sole, plants, target, lift)
+    if target is not None:
+        plants = eqx.tree_at(lambda p: p.floor, plants, target)
+    return FootFit(result, base, plants, method, reachable, details, sole)
 
 
-def _root(base: Motion, sole: Sole, plants: Footplants, speed, target: Floor | None, vertical: str) -> FootFit:
-    frames = np.arange(base.frame_count)
-    paths, root = sole_paths(sole, base), np.asarray(base.root, float)
-    rows = rows_of(sole, plants.vertex)
+def _root(base: Motion, sole, plants, paths, rows, speed, target, vertical) -> tuple[Motion, dict[str, float]]:
+    """The root method: the motion, and the offset [m] and scale of its heights."""
+    frames, root = np.arange(base.frame_count), np.asarray(base.root, float)
     held = plants.primary >= 0
     standing_on = np.where(held, rows[frames, np.maximum(plants.primary, 0)], -1)
     moved = horizontal_path(root, paths - root[:, None], standing_on, speed, sole.side, float(base.dt))
@@ -226,6 +236,4 @@ def _root(base: Motion, sole: Sole, plants: Footplants, speed, target: Floor | N
         heights = plants.floor.above(root)
     moved[:, 1] = floor.at(moved) + heights
     new_root = moved.astype(np.asarray(base.root).dtype)
-    result = Motion(base.skeleton, new_root, base.rotations, base.dt, base.translations)
-    on_target = Footplants(plants.planted, plants.vertex, plants.confidence, plants.primary, floor, plants.dt)
-    return FootFit(result, base, on_target, "root", np.ones_like(plants.planted), details, sole)
+    return Motion(base.skeleton, new_root, base.rotations, base.dt, base.translations), details
