@@ -87,7 +87,8 @@ def find_constraints(
 
     Each strike opens the bounding frames of table 1 for its foot, scaled to the length of the cycle around it;
     walking or running is told by the Froude number. A clip without strikes (standing, a jump) is one interval, as
-    far as nothing better is known: `plants` that no strike explains bound intervals of their own.
+    far as nothing better is known: `plants` keep the bounding frames within the foot's own plants, and one that no
+    strike explains bounds an interval of its own.
     """
     floor = floor or Floor()
     frames, joints = motion.frame_count, foot_joints(motion.skeleton)
@@ -98,6 +99,10 @@ def find_constraints(
 
     def add(foot: int, part: int, first: int, last: int) -> None:
         first, last = max(first, 0), min(last, frames - 1)
+        own = [p for p in plants if SIDES.index(p.foot) == foot]
+        if own:
+            best = max(own, key=lambda p: min(p.end, last) - max(p.start, first))
+            first, last = max(first, best.start), min(last, best.end)
         if first <= last:
             a, b = adaptive_threshold(heights[foot][part][first : last + 1], correctness)
             constraints.append(Constraint(foot, part, first + a, first + b))

@@ -133,8 +133,8 @@ def enforce(
 
     Per leg a chain of six degrees of freedom from hip to toe and two positional effectors: the ankle first, then
     the toe, by prioritized inverse kinematics with damping and joint limits (5.1). Their paths are (9). A goal is
-    the effector's own place at the beginning of its constraint, put at the height over the floor that the joint
-    has in the bind pose. Where only one of both is held the other's path is drawn to the foot's length from it, so
+    the effector's mean place over its constraint (the source takes the one at its beginning), put at the height over
+    the floor that the joint has in the bind pose. Where only one of both is held the other's path is drawn to the foot's length from it, so
     that both can be met. The character comes down where a leg is too short.
     """
     skeleton, dt = base.skeleton, float(base.dt)
@@ -187,7 +187,7 @@ def _goals(
             start = c.start if not found else max(c.start, found[-1][1] + 2)
             if start > c.end:
                 continue
-            goal = positions[start, joint].copy()
+            goal = positions[start : c.end + 1, joint].mean(0)
             goal[1] = floor.at(goal) + standing[joint]
             if part == 1:
                 heel = next((g for a, b, g in goals[0] if a <= c.end and b >= start), None)

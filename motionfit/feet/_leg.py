@@ -19,12 +19,14 @@ from motionfit.feet._detect import smooth
 from motionfit.feet._floor import Floor
 from motionfit.feet._plants import Footplants, runs
 from motionfit.feet._root import horizontal_path, root_steps
-from motionfit.feet._sole import Sole
+from motionfit.feet._sole import Sole, sole_paths
 from motionfit.ik import move_limb
 
 CALM = 0.25  # [s] over which the root's correction is averaged, twice: the legs take the rest
 EASE = 0.12  # [s] within which a foot comes to rest and leaves again
-STRETCH = 0.9995  # of a leg's length: beyond, the knee angle would change by degrees for a millimetre
+EVEN = 0.1  # [s] over which the height of a standing sole is averaged: its noise would go to the knee
+EXACT = 1e-9  # [m] to which the vertices that stand are brought to their places
+STRETCH = 0.99  # of a leg's length: near the end the knee turns by degrees for a millimetre at the foot
 LOWEST = 0.1  # of a leg's length, as far as the character is lowered for the legs' sake
 
 
@@ -69,10 +71,10 @@ def hold_feet(
     """How far [m] each foot must move in each frame so that it stands still, on the floor, while it is planted.
 
     In a plant the vertex stood on keeps its horizontal place (chosen so that the foot moves as little as possible on
-    the whole) and the foot's lowest vertex is on the floor. Between two plants the move goes over from one to the
+    the whole) and the foot's lowest vertex, its height averaged over a moment, is on the floor. Between two plants the move goes over from one to the
     other, with the speeds that the foot needs to come to rest, and a swinging sole does not go under the floor.
     """
-    frames = len(paths)
+    frames, even = len(paths), 2 * round(EVEN / dt / 2) + 1
     moves = np.zeros((frames, 2, 3))
     for foot in (0, 1):
         mine = sole.of(foot)
@@ -84,7 +86,7 @@ def hold_feet(
         for start, end in plants:
             held = np.concatenate([np.zeros((1, 3)), np.cumsum(steps[start:end], axis=0)])
             held -= held.mean(0)
-            held[:, 1] = floor.at(held) - floor.height - lowest[start : end + 1]
+            held[:, 1] = floor.at(held) - floor.height - smooth(lowest[start : end + 1], even)
             move[start : end + 1] = held
         if plants:
             _pass_over(move, plants, dt)
@@ -194,8 +196,19 @@ def with_leg_ik(
     down = lowering(legs, targets, dt) if lift is None else np.full(base.frame_count, float(lift))
     below = np.array([0.0, 1.0, 0.0]) * down[:, None]
     legs = [leg._replace(hip=leg.hip - below, knee=leg.knee - below, ankle=leg.ankle - below) for leg in legs]
-    local, reachable = turn_legs(base, legs, targets, rotations)
+    wanted = paths + (shift[:, None] + moves[:, sole.side])
+    standing = rows >= 0
     dtype = np.asarray(base.root).dtype
-    result = Motion(base.skeleton, (moved - below).astype(dtype), local.astype(np.asarray(base.rotations).dtype),
-                    base.dt, base.translations)  # fmt: skip
+    for _ in range(4):
+        local, reachable = turn_legs(base, legs, targets, rotations)
+        result = Motion(base.skeleton, moved - below, local, base.dt, base.translations)
+        # a sole vertex that hangs on the shank's skin too is not yet quite where it should be: once more
+        missing = np.take_along_axis(wanted - sole_paths(sole, result), np.maximum(rows, 0)[..., None], axis=1)
+        missing = np.where((standing & reachable)[..., None], missing, 0.0)
+        if np.abs(missing).max() < EXACT:
+            break
+        targets = [target + missing[:, side] for side, target in enumerate(targets)]
+    reachable |= ~standing
+    result = Motion(base.skeleton, result.root.astype(dtype), local.astype(np.asarray(base.rotations).dtype), base.dt,
+                    base.translations)  # fmt: skip
     return result, reachable, {"lowered_max_m": float(down.max())}
