@@ -365,14 +365,14 @@ def feet_summary(
         return float(np.percentile(x, q)) if len(x) else None
 
     return {
-        "slide_max_m_s": percentile(slide, 100),
-        "slide_p95_m_s": percentile(slide, 95),
+        "slide_max_m_s": percentile(slide, 100.0),
+        "slide_p95_m_s": percentile(slide, 95.0),
         "slide_path_m": slide_path(slide, dt),
         "contact_frames": int((carrying >= 0).sum()),
         "ground_penetration_max_m": ground_penetration(heights),
         "floating_max_m": floating(low_heights, standing_on >= 0),
-        "handover_slide_max_m_s": percentile(handover, 100),
-        "other_slide_p95_m_s": percentile(second, 95),
+        "handover_slide_max_m_s": percentile(handover, 100.0),
+        "other_slide_p95_m_s": percentile(second, 95.0),
         "skate_ratio": skate_ratio(low_points, low_heights, dt),
         "weighted_skate_m_s": weighted_skate(low_points, low_heights, dt),
     }

@@ -49,17 +49,21 @@ def central_difference(fn, x: np.ndarray, step: float = 1e-6) -> np.ndarray:
 
 
 def with_legs(character: Character, scale: float) -> Character:
-    """The character with thighs and calves `scale` times as long, standing on the same floor."""
+    """The character with thighs and calves `scale` times as long, standing on the same floor; skin stretched along."""
     skeleton, skin = character.skeleton, character.skin
     old = bind_pose(skeleton)[0]
-    offsets = np.array(skeleton.offsets, float)
+    offsets, stretch = np.array(skeleton.offsets, float), np.zeros((len(old), 3, 3))
     for side in ("left", "right"):
-        for role in ("calf", "foot"):
-            offsets[skeleton.joint(f"{side}_{role}")] *= scale
-    longer = eqx.tree_at(lambda s: s.offsets, skeleton, offsets)
+        for joint, end in (("thigh", "calf"), ("calf", "foot")):
+            a, b = (skeleton.joint(f"{side}_{r}") for r in (joint, end))
+            bone = (old[b] - old[a]) / np.linalg.norm(old[b] - old[a])
+            stretch[a] = (scale - 1.0) * np.outer(bone, bone)
+            offsets[b] *= scale
     foot = skeleton.joint("left_foot")
-    offsets[0, 1] += old[foot, 1] - bind_pose(longer)[0][foot, 1]
+    lowered = bind_pose(eqx.tree_at(lambda s: s.offsets, skeleton, offsets))[0][foot, 1]
+    offsets[0, 1] += old[foot, 1] - lowered
     longer = eqx.tree_at(lambda s: s.offsets, skeleton, offsets)
-    shift = bind_pose(longer)[0] - old
-    moved = np.asarray(skin.vertices_bind) + np.einsum("vk,vka->va", skin.weights, shift[np.asarray(skin.joints)])
+    joints, weights, vertices = np.asarray(skin.joints), np.asarray(skin.weights), np.asarray(skin.vertices_bind)
+    moved = vertices + np.einsum("vk,vka->va", weights, (bind_pose(longer)[0] - old)[joints])
+    moved = moved + np.einsum("vk,vkab,vkb->va", weights, stretch[joints], vertices[:, None] - old[joints])
     return Character(longer, Skin(moved, skin.faces, skin.joints, skin.weights), f"{character.name} legs {scale:g}")

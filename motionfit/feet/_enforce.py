@@ -13,16 +13,16 @@ from motionfit.feet._floor import Floor
 from motionfit.feet._leg import Leg, find_legs, lowering
 from motionfit.feet._plants import Footplants
 from motionfit.feet._sole import Sole, sole_paths
-from motionfit.ik import Task, prioritized
+from motionfit.ik import Task, move_limb, prioritized
 
-EASE = 0.12  # [s] sigma of (9)
+EASE = 0.16  # [s] sigma of (9)
 KNEE = (0.0, 2.7)  # [rad] how far a knee bends
 ANKLE = 1.2  # [rad] how far the ankle may be turned away from the clip, about each of its axes
 HIP = 1.0  # [rad] and the hip
 REACHED = 1e-4  # [m]
 
 
-def descending_step(t: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+def descending_step(t: Float[np.ndarray, "..."] | float) -> Float[np.ndarray, "..."] | float:
     """The descending cubic step 2t^3 - 3t^2 + 1 of (10), from 1 to 0 over 0..1."""
     t = np.clip(t, 0.0, 1.0)
     return (2 * t - 3) * t * t + 1
@@ -74,7 +74,9 @@ class Chain(NamedTuple):
     ankle_axes: np.ndarray  # (frames, 2, 3)
 
 
-def chain_pose(chain: Chain, values: np.ndarray) -> tuple[np.ndarray, ...]:
+def chain_pose(
+    chain: Chain, values: np.ndarray
+) -> tuple[Rotation, Rotation, Rotation, np.ndarray, np.ndarray, np.ndarray]:
     """Turns of thigh, shank and foot (rotation vectors from the clip's pose on), with knee, ankle and toe."""
     upper = Rotation.from_rotvec(values[:, :3])
     lower = upper * Rotation.from_rotvec(values[:, 3:4] * chain.knee_axis)
@@ -150,10 +152,10 @@ def enforce(
     ease = max(1, round(EASE / dt))
     paths, goals = [], []
     for side, mine in enumerate(joints):
-        goals.append(_goals([c for c in constraints if c.foot == side], mine, positions, standing, floor))
+        goals.append(_goals([c for c in constraints if c.foot == side], mine, positions, standing, floor, ease))
         paths.append([effector_path(positions[:, j], goals[side][part], ease) for part, j in enumerate(mine)])
         if len(mine) == 2:
-            _keep_foot_length(*paths[side], goals[side], positions[:, mine[1]] - positions[:, mine[0]])
+            _keep_foot_length(*paths[side], goals[side], positions[:, mine[1]] - positions[:, mine[0]], ease)
     legs = find_legs(skeleton, positions, rotations)
     down = lowering(legs, [p[0] for p in paths], dt) if lift is None else np.full(base.frame_count, float(lift))
     positions = positions - np.array([0.0, 1.0, 0.0]) * down[:, None, None]
@@ -177,44 +179,63 @@ Goal = tuple[int, int, np.ndarray]
 
 
 def _goals(
-    constraints: list[Constraint], joints: tuple[int, ...], positions: np.ndarray, standing: np.ndarray, floor: Floor
+    constraints: list[Constraint], joints: tuple[int, ...], positions: np.ndarray, standing: np.ndarray, floor: Floor,
+    ease: int,
 ) -> list[list[Goal]]:
-    """Per effector of a foot the goals (start, end, position), in order and apart from each other."""
+    """Per effector of a foot the goals (start, end, position), in order and at least an ease apart."""
     goals: list[list[Goal]] = []
     for part, joint in enumerate(joints):
         found: list[Goal] = []
         for c in sorted((c for c in constraints if c.part == part), key=lambda c: c.start):
-            start = c.start if not found else max(c.start, found[-1][1] + 2)
+            start = c.start if not found else max(c.start, found[-1][1] + ease)
             if start > c.end:
                 continue
             goal = positions[start : c.end + 1, joint].mean(0)
             goal[1] = floor.at(goal) + standing[joint]
+            end = c.end
             if part == 1:
-                heel = next((g for a, b, g in goals[0] if a <= c.end and b >= start), None)
-                if heel is not None:
+                heels = [(a, g) for a, b, g in goals[0] if a <= c.end and b >= start]
+                # a heel that comes down elsewhere takes the toe along
+                end = min([end, *(a - ease for a, _ in heels[1:])])
+                if end < start:
+                    continue
+                if heels:
+                    heel = heels[0][1]
                     # held together, they are as far apart as the foot is long
                     length = np.linalg.norm(positions[start, joint] - positions[start, joints[0]])
                     away = (goal - heel) * [1.0, 0.0, 1.0]
                     level = np.sqrt(max(length**2 - (goal[1] - heel[1]) ** 2, 0.0))
                     goal = heel + away * level / max(np.linalg.norm(away), 1e-9) + [0.0, goal[1] - heel[1], 0.0]
-            found.append((start, c.end, goal))
+            found.append((start, end, goal))
         goals.append(found)
     return goals
 
 
-def _keep_foot_length(ankle: np.ndarray, toe: np.ndarray, goals: list[list[Goal]], foot: np.ndarray) -> None:
-    """Draw the path of the effector that is not held to the foot's length from the other one, in place."""
-    length = np.linalg.norm(foot, axis=1, keepdims=True)
+def _keep_foot_length(
+    ankle: np.ndarray, toe: np.ndarray, goals: list[list[Goal]], foot: np.ndarray, ease: int
+) -> None:
+    """Draw the path of the effector that is not held to the foot's length from the other one, in place.
+
+    Where the toe alone is held the ankle gives way; before (if it lands first) and after, the ankle comes back to its
+    own path within an ease. Everywhere else the toe gives way.
+    """
+    frames, length = np.arange(len(ankle)), np.linalg.norm(foot, axis=1, keepdims=True)
     held = [np.zeros(len(ankle), bool) for _ in goals]
     for mask, mine in zip(held, goals, strict=True):
         for start, end, _ in mine:
             mask[start : end + 1] = True
-    away = toe - ankle
-    away = away * length / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
-    free_toe = ~held[1]
-    move_ankle = held[1] & ~held[0]
-    ankle[move_ankle] = (toe - away)[move_ankle]
-    toe[free_toe] = (ankle + away)[free_toe]
+    share = np.zeros(len(ankle))
+    for start, end, _ in goals[1]:
+        into = (start - frames) / ease if not held[0][start] else np.where(frames < start, 1.0, 0.0)
+        share = np.maximum(share, descending_step(np.maximum(np.maximum(into, (frames - end) / ease), 0.0)))
+    share[held[0]] = 0.0
+
+    def away() -> np.ndarray:
+        apart = toe - ankle
+        return apart * length / np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-9)
+
+    ankle += share[:, None] * (toe - away() - ankle)
+    toe[~held[1]] = (ankle + away())[~held[1]]
 
 
 def _turn_leg(
@@ -241,6 +262,11 @@ def _turn_leg(
     busy = np.max([np.abs(task(values)[0]).max(1) for task in tasks], axis=0) > 1e-12
     if busy.any():
         some = Chain(*(x[busy] for x in chain))
+        # the analytic leg is the start: from a straight knee no gradient says which way to bend
+        found = move_limb(leg.hip[busy], leg.knee[busy], leg.ankle[busy], paths[0][busy], leg.lateral[busy])
+        values[busy, :3] = found.upper.as_rotvec()
+        knee = (found.upper.inv() * found.lower).as_rotvec()
+        values[busy, 3] = np.einsum("fa,fa->f", knee, some.knee_axis)
         values[busy] = prioritized(chain_tasks(some, [p[busy] for p in paths]), values[busy], lower=lower[busy],
                                    upper=upper[busy])  # fmt: skip
         turns = chain_pose(some, values[busy])[:3]

@@ -23,11 +23,11 @@ class Floor(NamedTuple):
     def at(self, points_world: Float[AnyArray, "... 3"]) -> Float[np.ndarray, "..."]:
         """Height of the floor [m] under (or over) points."""
         points = np.asarray(points_world, float)
-        return self.height + self.slope_x * points[..., 0] + self.slope_z * points[..., 2]
+        return np.asarray(self.height + self.slope_x * points[..., 0] + self.slope_z * points[..., 2])
 
     def above(self, points_world: Float[AnyArray, "... 3"]) -> Float[np.ndarray, "..."]:
         """Height of points over the floor [m], measured along the vertical."""
-        return np.asarray(points_world, float)[..., 1] - self.at(points_world)
+        return np.asarray(np.asarray(points_world, float)[..., 1] - self.at(points_world))
 
     @property
     def tilt(self) -> float:

@@ -71,10 +71,11 @@ def _find_sole(character: Character, cells: int | None, include: tuple[int, ...]
             raise InputError(f"{character.name}: no vertex follows {name}_foot or {name}_toe most, so it has no sole; "
                              "give the foot's skin weights on them, or name the joints with a role mapping")  # fmt: skip
         low = mine[_facing_down(vertices, np.asarray(skin.faces), mine)]
-        # the top of a foot faces down only where the mesh is inside out: its sole must be in the foot's lower half
-        middle = 0.5 * (vertices[mine, 1].min() + vertices[mine, 1].max())
-        low = low[vertices[low, 1] < middle]
-        if len(low) == 0:
+        # where the mesh is inside out the top of the foot faces down: a sole has to be in the lower half of the foot,
+        # and to begin at its bottom
+        bottom, top = vertices[mine, 1].min(), vertices[mine, 1].max()
+        low = low[vertices[low, 1] < 0.5 * (bottom + top)]
+        if len(low) == 0 or vertices[low, 1].min() > bottom + 0.05 * (top - bottom):
             raise InputError(f"{character.name}: no vertex of the {name} foot faces down in the bind pose; bind the "
                              "character standing upright (y up), with triangles turned outwards")  # fmt: skip
         thin = low if cells is None else _lowest_per_cell(vertices, low, cells)

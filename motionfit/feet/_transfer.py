@@ -15,16 +15,16 @@ def catmull_rom(points: Float[np.ndarray, "4 *rest"]) -> Float[np.ndarray, "4 *r
     return np.stack([0.5 * (3 * (b - c) + d - a), a - 2.5 * b + 2 * c - 0.5 * d, 0.5 * (c - a), b])
 
 
-def evaluate(coefficients: Float[np.ndarray, "4 *rest"], q: Float[np.ndarray, "*rest"]) -> Float[np.ndarray, "*rest"]:
+def evaluate(coefficients: Float[np.ndarray, "4 ..."], q: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """A cubic at q (Horner)."""
     a, b, c, d = coefficients
-    return ((a * q + b) * q + c) * q + d
+    return np.asarray(((a * q + b) * q + c) * q + d)
 
 
-def integral(coefficients: Float[np.ndarray, "4 *rest"], q: Float[np.ndarray, "*rest"]) -> Float[np.ndarray, "*rest"]:
+def integral(coefficients: Float[np.ndarray, "4 ..."], q: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """The integral of a cubic from 0 to q."""
     a, b, c, d = coefficients
-    return (((a / 4 * q + b / 3) * q + c / 2) * q + d) * q
+    return np.asarray((((a / 4 * q + b / 3) * q + c / 2) * q + d) * q)
 
 
 def cubic_roots(coefficients: Float[np.ndarray, "4 *rest"]) -> Float[np.ndarray, "3 *rest"]:

@@ -11,6 +11,8 @@ from jaxtyping import Bool, Float
 
 Task = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
+CALM = 10  # steps before the longest step shrinks, as one over their number
+POLISH = 20  # last steps of the tasks above the lowest one
 RANK = 1e-6  # singular values below this share of the greatest are directions that a task cannot move
 
 
@@ -48,8 +50,8 @@ def limited_step(
     jacobians: Sequence[Float[np.ndarray, "batch _ joints"]],
     errors: Sequence[Float[np.ndarray, "batch _"]],
     values: Float[np.ndarray, "batch joints"],
-    lower: Float[np.ndarray, "#batch joints"],
-    upper: Float[np.ndarray, "#batch joints"],
+    lower: Float[np.ndarray, "... joints"],
+    upper: Float[np.ndarray, "... joints"],
     *,
     damping: float = 0.0,
 ) -> Float[np.ndarray, "batch joints"]:
@@ -74,11 +76,11 @@ def prioritized(
     tasks: Sequence[Task],
     values: Float[np.ndarray, "batch joints"],
     *,
-    lower: Float[np.ndarray, "#batch joints"] | None = None,
-    upper: Float[np.ndarray, "#batch joints"] | None = None,
+    lower: Float[np.ndarray, "... joints"] | None = None,
+    upper: Float[np.ndarray, "... joints"] | None = None,
     damping: float = 0.1,
     tolerance: float = 1e-9,
-    max_steps: int = 50,
+    max_steps: int = 30,
     max_change: float = 0.3,
 ) -> Float[np.ndarray, "batch joints"]:
     """Joint values that serve the tasks in order of priority, by repeated steps from `values` on.
@@ -86,23 +88,32 @@ def prioritized(
     A task is a function of the values (batch, joints) that returns its error (batch, m), what is missing, and the
     Jacobian (batch, m, joints) of what it moves. `damping` is taken times the largest error and at most as it is:
     far away the steps are cautious, near the goal they converge like Newton's. No step changes a joint by more than
-    `max_change`. Ends when no error and no step is over `tolerance`, or after `max_steps`.
+    `max_change`, which shrinks after the first `CALM` steps: tasks that cannot be met together would otherwise pull
+    the values to and fro. A last word is given to the tasks from below upwards, so that the first is met best. Ends
+    when no step is over `tolerance`, or after `max_steps`.
     """
     lower = np.broadcast_to(-np.inf if lower is None else lower, values.shape)
     upper = np.broadcast_to(np.inf if upper is None else upper, values.shape)
     values = np.clip(values, lower, upper)
-    active = np.arange(len(values))
-    for _ in range(max_steps):
-        found = [task(values) for task in tasks]
-        errors, jacobians = [e[active] for e, _ in found], [j[active] for _, j in found]
-        worst = max((float(np.abs(e).max(initial=0.0)) for e in errors), default=0.0)
-        change = limited_step(jacobians, errors, values[active], lower[active], upper[active], damping=damping * min(worst, 1.0))
-        longest = np.abs(change).max(1, initial=0.0)
-        change *= np.minimum(1.0, max_change / np.maximum(longest, 1e-300))[:, None]
-        values = values.copy()
-        values[active] = np.clip(values[active] + change, lower[active], upper[active])
-        # what no longer moves has arrived, or is as near as its limits and its reach allow
-        active = active[longest > tolerance]
-        if len(active) == 0:
-            break
+    levels = range(len(tasks), 0, -1)
+    active = np.ones(len(values), bool)
+    for level in levels:
+        for step in range(max_steps if level == len(tasks) else POLISH):
+            found = [task(values) for task in tasks[:level]]
+            if level < len(tasks):
+                # the polish is for what the lower tasks have left undone above them
+                active = np.max([np.abs(e).max(1) for e, _ in found], axis=0) > tolerance
+            if not active.any():
+                break
+            errors, jacobians = [e[active] for e, _ in found], [j[active] for _, j in found]
+            worst = max(float(np.abs(e).max()) for e in errors)
+            change = limited_step(jacobians, errors, values[active], lower[active], upper[active],
+                                  damping=damping * min(worst, 1.0))  # fmt: skip
+            longest = np.abs(change).max(1, initial=0.0)
+            bound = max_change * min(1.0, CALM / (step + 1))
+            change *= np.minimum(1.0, bound / np.maximum(longest, 1e-300))[:, None]
+            values = values.copy()
+            values[active] = np.clip(values[active] + change, lower[active], upper[active])
+            # what no longer moves has arrived, or is as near as its limits and its reach allow
+            active[active] = longest > tolerance
     return values
