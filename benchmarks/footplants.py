@@ -76,7 +76,7 @@ def score(found: list[np.ndarray], clips: list[Labelled]) -> dict[str, float]:
                 if run[last] not in (0, len(hand) - 1):
                     off = min((abs(run[last] - e) for e in edges), default=len(hand)) * to_120
                     errors.append(min(off, 24.0))  # beyond 0.2 s it is another boundary
-        for start, end in runs(~hand.any(1)):
+        for start, end in runs(~np.any(hand, axis=1)):
             if (end - start + 1) * float(motion.dt) >= 0.05:
                 flights += 1
                 seen += bool((~planted[start : end + 1].any(1)).mean() > 0.5)

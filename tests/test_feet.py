@@ -14,10 +14,26 @@ from scipy.spatial.transform import Rotation
 
 import motionfit as mf
 from motionfit import samples
-from motionfit._motion import bind_pose, host_kinematics, rest_motion
+from motionfit._character import PARTS
+from motionfit._motion import bind_pose, host_kinematics, joint_angles, rest_motion
+from motionfit.cli import main
 from motionfit.feet import (
-    Floor, Plant, catmull_rom, cubic_roots, find_sole, fit_floor, frame_heights, horizontal_path, load_labels, place_at,
-    root_steps, save_labels, scaled_heights, sole_paths, transfer_instant, vertical_scale,
+    Floor,
+    Plant,
+    catmull_rom,
+    cubic_roots,
+    find_sole,
+    fit_floor,
+    frame_heights,
+    horizontal_path,
+    load_labels,
+    place_at,
+    root_steps,
+    save_labels,
+    scaled_heights,
+    sole_paths,
+    transfer_instant,
+    vertical_scale,
 )  # fmt: skip
 from motionfit.feet._cycles import adaptive_threshold, find_constraints
 from motionfit.feet._detect import smooth, two_state_path
@@ -178,7 +194,7 @@ def test_vertical_scale_is_the_minimum_of_the_variance(seed):
     assert offset == pytest.approx(-soles.mean())
     moved, relative = root + offset, soles - root
     cost = lambda a: float(((moved.mean() + a * (moved - moved.mean()) + relative) ** 2).sum())  # noqa: E731
-    best = minimize_scalar(cost, bounds=(0.5, 2.0), method="bounded", options={"xatol": 1e-10}).x
+    best: float = minimize_scalar(cost, bounds=(0.5, 2.0), method="bounded", options={"xatol": 1e-10}).x  # type: ignore
     assert scale == pytest.approx(best, abs=1e-6)
 
 
@@ -256,14 +272,17 @@ def subdivided(body: mf.Character, times: int) -> mf.Character:
     skin = body.skin
     vertices, faces = np.asarray(skin.vertices_bind, float), np.asarray(skin.faces)
     joints, weights = np.asarray(skin.joints), np.asarray(skin.weights, float)
-    feet = np.isin(body.part_of_vertex[faces], [mf._character.PARTS.index(f"{s}_foot") for s in ("left", "right")])
+    feet = np.isin(body.part_of_vertex[faces], [PARTS.index(f"{s}_foot") for s in ("left", "right")])
     fine, rest = faces[feet.all(1)], faces[~feet.all(1)]
     for _ in range(times):
         edges = np.sort(np.concatenate([fine[:, [0, 1]], fine[:, [1, 2]], fine[:, [2, 0]]]), axis=1)
         unique, index = np.unique(edges, axis=0, return_inverse=True)
         middle = len(vertices) + index.reshape(3, -1)
         vertices = np.concatenate([vertices, vertices[unique].mean(1)])
-        joints, weights = np.concatenate([joints, joints[unique[:, 0]]]), np.concatenate([weights, weights[unique[:, 0]]])
+        joints, weights = (
+            np.concatenate([joints, joints[unique[:, 0]]]),
+            np.concatenate([weights, weights[unique[:, 0]]]),
+        )
         a, b, c = fine.T
         ab, bc, ca = middle
         fine = np.concatenate([np.stack(t, 1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
@@ -347,7 +366,11 @@ def test_labels_override_and_their_vertices_are_held(average, tmp_path):
     (tmp_path / "l.csv").write_text(f"foot,vertex,start,end\nleft,{vertex},10,30\nright,any,40,50\n")
     found = mf.remove_footskate(walk, average, labels=tmp_path / "l.csv")
     labels = found.plants.labels
-    assert set(labels[10:31]) == {"left"} and set(labels[40:51]) == {"right"} and (labels == "none").sum() == len(labels) - 32
+    assert (
+        set(labels[10:31]) == {"left"}
+        and set(labels[40:51]) == {"right"}
+        and (labels == "none").sum() == len(labels) - 32
+    )
     assert (found.plants.vertex[10:31, 0] == vertex).all()
     held = posed_vertices(average, found.motion[np.arange(10, 31)])[:, vertex]
     assert np.ptp(held[:, [0, 2]], axis=0).max() < 1e-6
@@ -479,7 +502,9 @@ def swaying(body: mf.Character, frames: int = 120) -> mf.Motion:
     positions, world = host_kinematics(motion)
     foot, calf = skeleton.joint("left_foot"), skeleton.joint("left_calf")
     level = Rotation.from_quat(fixed[foot], scalar_first=True)
-    rotations[:, foot] = (Rotation.from_quat(world[:, calf], scalar_first=True).inv() * level).as_quat(scalar_first=True)
+    rotations[:, foot] = (Rotation.from_quat(world[:, calf], scalar_first=True).inv() * level).as_quat(
+        scalar_first=True
+    )
     root = bind_pose(skeleton)[0][foot] + [0.3, 0.04, -0.2] - positions[:, foot]
     return mf.Motion(skeleton, root, rotations, 1 / 60)
 
@@ -511,7 +536,11 @@ def test_skate_that_was_put_in_is_taken_out(average):
 def test_root_method_on_longer_and_shorter_legs(average, scale, path):
     walk = samples.walk(cycles=4)
     body = with_legs(average, scale)
-    motion = mf.onto(walk, body.skeleton) if path == "scaled" else mf.Motion(body.skeleton, walk.root, walk.rotations, walk.dt)
+    motion = (
+        mf.onto(walk, body.skeleton)
+        if path == "scaled"
+        else mf.Motion(body.skeleton, walk.root, walk.rotations, walk.dt)
+    )
     found = mf.remove_footskate(motion, body)
     assert found.motion.rotations is motion.rotations
     after = found.measure(found.motion)
@@ -568,14 +597,17 @@ def test_leg_ik_holds_both_feet_exactly_without_snapping(heavy):
             held = paths[frames, found.sole.row(int(vertex))]
             assert np.ptp(held[:, [0, 2]], axis=0).max() < 1e-6
     base = found.base
-    assert derivative_ratio(found.motion, base, 2) < 1.2
+    assert (derivative_ratio(found.motion, base, 2) or 9.0) < 1.2
     assert found.measure(found.motion)["ground_penetration_max_m"] < 0.02
     # only legs turn, and the feet keep their direction
-    turned = mf._motion.joint_angles(found.motion, base).max(0)
+    turned = joint_angles(found.motion, base).max(0)
     legs = [base.skeleton.joint(f"{s}_{r}") for s in ("left", "right") for r in ("thigh", "calf", "foot")]
     assert np.delete(turned, legs).max() < 1e-12
     feet = [base.skeleton.joint(f"{s}_foot") for s in ("left", "right")]
-    a, b = (Rotation.from_quat(host_kinematics(m)[1][:, feet].reshape(-1, 4), scalar_first=True) for m in (base, found.motion))
+    a, b = (
+        Rotation.from_quat(host_kinematics(m)[1][:, feet].reshape(-1, 4), scalar_first=True)
+        for m in (base, found.motion)
+    )
     assert (a.inv() * b).magnitude().max() < 1e-7
 
 
@@ -589,7 +621,9 @@ def test_legs_that_cannot_reach_say_so_and_come_as_near_as_they_can(average):
     positions, _ = host_kinematics(found.motion)
     for side, name in enumerate(("left", "right")):
         hip, knee, ankle = (positions[:, walk.skeleton.joint(f"{name}_{r}")] for r in ("thigh", "calf", "foot"))
-        stretched = np.linalg.norm(ankle - hip, axis=1) / (np.linalg.norm(knee - hip, axis=1) + np.linalg.norm(ankle - knee, axis=1))
+        stretched = np.linalg.norm(ankle - hip, axis=1) / (
+            np.linalg.norm(knee - hip, axis=1) + np.linalg.norm(ankle - knee, axis=1)
+        )
         assert (stretched[~found.reachable[:, side]] > 0.999).all()
     # lowered as far as the legs need, they reach
     assert mf.remove_footskate(flying, average, "leg-ik", plants=plants).reachable.all()
@@ -632,7 +666,9 @@ def test_effector_path_is_eq_9_and_continuous(rng):
     calm = effector_path(own, [(t1, t2, goal)], sigma)
     speed = np.linalg.norm(np.diff(calm, axis=0), axis=1)
     most = np.linalg.norm(np.diff(own, axis=0), axis=1).max()
-    assert speed[t1 - 1] < 0.35 * most and np.linalg.norm(np.diff(printed, axis=0), axis=1)[t1 - 1] > 0.9 * speed[t1 - 1]
+    assert (
+        speed[t1 - 1] < 0.35 * most and np.linalg.norm(np.diff(printed, axis=0), axis=1)[t1 - 1] > 0.9 * speed[t1 - 1]
+    )
     assert [float(descending_step(np.array(x))) for x in (0.0, 0.5, 1.0)] == [1.0, 0.5, 0.0]
 
 
@@ -641,9 +677,12 @@ def test_adaptive_holds_heel_and_toe(body, request):
     character, walk = request.getfixturevalue(body), samples.walk(cycles=3)
     found = mf.remove_footskate(walk, character, "adaptive")
     assert found.details["ankle_error_max_m"] < 1e-4 and found.details["toe_error_max_m"] < 0.01
-    assert found.reachable.all() and derivative_ratio(found.motion, found.base, 2) < 1.2
+    assert found.reachable.all() and (derivative_ratio(found.motion, found.base, 2) or 9.0) < 1.2
     feet = [walk.skeleton.joint(f"{s}_{r}") for s in ("left", "right") for r in ("foot", "toe")]
-    jump = [np.linalg.norm(np.diff(host_kinematics(m)[0][:, feet], 2, axis=0), axis=-1).max() for m in (found.motion, found.base)]
+    jump = [
+        np.linalg.norm(np.diff(host_kinematics(m)[0][:, feet], 2, axis=0), axis=-1).max()
+        for m in (found.motion, found.base)
+    ]
     fastest = np.linalg.norm(np.diff(host_kinematics(found.base)[0][:, feet], axis=0), axis=-1).max()
     assert jump[0] < jump[1] + 0.05 * fastest
 
@@ -688,8 +727,8 @@ def test_measure_feet_of_a_motion_alone(average):
 def run(monkeypatch, capsys, *arguments) -> tuple[int, str]:
     monkeypatch.setattr(sys, "argv", ["motionfit", "footskate", *map(str, arguments)])
     with pytest.raises(SystemExit) as exit_:
-        mf.cli.main() if hasattr(mf, "cli") else __import__("motionfit.cli", fromlist=["main"]).main()
-    return exit_.value.code, capsys.readouterr().err
+        main()
+    return int(exit_.value.code or 0), capsys.readouterr().err
 
 
 @pytest.mark.parametrize("method", ["root", "leg-ik", "adaptive"])
@@ -774,4 +813,4 @@ def test_root_method_on_every_clip(shared_data, male, folder):
 def test_leg_ik_on_walks_runs_and_jumps(shared_data, male):
     for name in ("02_01_walk", "16_36_run", "16_05_forward_jump", "05_03_dance_folding_arms"):
         found = mf.remove_footskate(mf.load_motion(shared_data / "bvh" / f"{name}.bvh"), male, "leg-ik")
-        assert found.status == "converged" and derivative_ratio(found.motion, found.base, 2) < 1.2, name
+        assert found.status == "converged" and (derivative_ratio(found.motion, found.base, 2) or 9.0) < 1.2, name

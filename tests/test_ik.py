@@ -64,7 +64,7 @@ def test_plane_angles_against_numerical_roots_of_c7():
 
     for k in (0, 1):
         closed = np.array([found.ankle[k, 0], found.hip[k, 0]])
-        np.testing.assert_allclose(fsolve(equations, closed + 0.05, xtol=1e-12), closed, atol=NUMERIC)
+        np.testing.assert_allclose(np.asarray(fsolve(equations, closed + 0.05, xtol=1e-12)), closed, atol=NUMERIC)
 
 
 def test_the_erratum_of_appendix_c():

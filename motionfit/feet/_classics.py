@@ -18,9 +18,7 @@ def foot_joints(skeleton: Skeleton) -> list[tuple[int, ...]]:
     return joints
 
 
-def fixed_thresholds(
-    motion: Motion, *, height: float = 0.05, speed: float = 0.5
-) -> Bool[np.ndarray, "frames 2"]:
+def fixed_thresholds(motion: Motion, *, height: float = 0.05, speed: float = 0.5) -> Bool[np.ndarray, "frames 2"]:
     """A foot is down where its ankle or its toe joint is lower than `height` [m] over where it is in the bind pose,
     and slower than `speed` [m/s]. Lee et al. 2002, Menardais et al. 2004 (Glardon 2006, 4.1); the floor is y = 0."""
     joints = foot_joints(motion.skeleton)

@@ -166,9 +166,7 @@ def _labels(evidence: Evidence, dt: float, size: float) -> tuple[np.ndarray, np.
     return planted, 1.0 / (1.0 + np.exp(-4.0 * both))
 
 
-def least_moving(
-    sole: Sole, evidence: Evidence, planted: Bool[np.ndarray, "frames 2"]
-) -> Int[np.ndarray, "frames 2"]:
+def least_moving(sole: Sole, evidence: Evidence, planted: Bool[np.ndarray, "frames 2"]) -> Int[np.ndarray, "frames 2"]:
     """The least moving sole vertex of each planted foot, frame by frame: thesis 3.1.1, second step. A vertex that is
     higher than the foot's lowest pays for its height. -1 where a foot is not down."""
     vertex = np.full(planted.shape, -1)
@@ -218,7 +216,11 @@ def choose_vertices(
 
 
 def choose_primary(
-    sole: Sole, evidence: Evidence, planted: Bool[np.ndarray, "frames 2"], vertex: Int[np.ndarray, "frames 2"], dt: float
+    sole: Sole,
+    evidence: Evidence,
+    planted: Bool[np.ndarray, "frames 2"],
+    vertex: Int[np.ndarray, "frames 2"],
+    dt: float,
 ) -> Int[np.ndarray, " frames"]:
     """The foot that carries: where both are down, the way of least slide between single supports (Viterbi)."""
     row_of = np.zeros(int(sole.vertices.max()) + 1, int)

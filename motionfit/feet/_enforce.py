@@ -155,7 +155,9 @@ def enforce(
         goals.append(_goals([c for c in constraints if c.foot == side], mine, positions, standing, floor, ease))
         paths.append([effector_path(positions[:, j], goals[side][part], ease) for part, j in enumerate(mine)])
         if len(mine) == 2:
-            _keep_foot_length(*paths[side], goals[side], positions[:, mine[1]] - positions[:, mine[0]], ease)
+            _keep_foot_length(
+                paths[side][0], paths[side][1], goals[side], positions[:, mine[1]] - positions[:, mine[0]], ease
+            )
     legs = find_legs(skeleton, positions, rotations)
     down = lowering(legs, [p[0] for p in paths], dt) if lift is None else np.full(base.frame_count, float(lift))
     positions = positions - np.array([0.0, 1.0, 0.0]) * down[:, None, None]
@@ -179,7 +181,11 @@ Goal = tuple[int, int, np.ndarray]
 
 
 def _goals(
-    constraints: list[Constraint], joints: tuple[int, ...], positions: np.ndarray, standing: np.ndarray, floor: Floor,
+    constraints: list[Constraint],
+    joints: tuple[int, ...],
+    positions: np.ndarray,
+    standing: np.ndarray,
+    floor: Floor,
     ease: int,
 ) -> list[list[Goal]]:
     """Per effector of a foot the goals (start, end, position), in order and at least an ease apart."""
@@ -211,9 +217,7 @@ def _goals(
     return goals
 
 
-def _keep_foot_length(
-    ankle: np.ndarray, toe: np.ndarray, goals: list[list[Goal]], foot: np.ndarray, ease: int
-) -> None:
+def _keep_foot_length(ankle: np.ndarray, toe: np.ndarray, goals: list[list[Goal]], foot: np.ndarray, ease: int) -> None:
     """Draw the path of the effector that is not held to the foot's length from the other one, in place.
 
     Where the toe alone is held the ankle gives way; before (if it lands first) and after, the ankle comes back to its

@@ -49,11 +49,13 @@ def find_legs(skeleton: Skeleton, positions: np.ndarray, rotations: np.ndarray) 
     over the clip, fixed in the thigh; a leg that never bends takes the character's left-right axis at bind."""
     legs = []
     for side in SIDES:
-        joints = tuple(skeleton.joint(f"{side}_{r}") for r in ("thigh", "calf", "foot"))
+        joints = skeleton.joint(f"{side}_thigh"), skeleton.joint(f"{side}_calf"), skeleton.joint(f"{side}_foot")
         hip, knee, ankle = (positions[:, j] for j in joints)
         turn = Rotation.from_quat(rotations[:, joints[0]], scalar_first=True)
         bend = turn.inv().apply(np.cross(knee - hip, ankle - knee)).sum(0)
-        if np.linalg.norm(bend) < 0.02 * np.sum(np.linalg.norm(knee - hip, axis=1) * np.linalg.norm(ankle - knee, axis=1)):
+        if np.linalg.norm(bend) < 0.02 * np.sum(
+            np.linalg.norm(knee - hip, axis=1) * np.linalg.norm(ankle - knee, axis=1)
+        ):
             bind = Rotation.from_quat(bind_pose(skeleton)[1][joints[0]], scalar_first=True)
             bend = bind.inv().apply([1.0, 0.0, 0.0])
         legs.append(Leg(joints, hip, knee, ankle, turn.apply(bend / np.linalg.norm(bend))))
@@ -117,9 +119,7 @@ def _pass_over(move: Float[np.ndarray, "frames 3"], plants: list[tuple[int, int]
         move[end + 1 : after] = filled
 
 
-def lowering(
-    legs: list[Leg], targets: list[Float[np.ndarray, "frames 3"]], dt: float
-) -> Float[np.ndarray, " frames"]:
+def lowering(legs: list[Leg], targets: list[Float[np.ndarray, "frames 3"]], dt: float) -> Float[np.ndarray, " frames"]:
     """How far [m] the character must come down so that both legs reach, as a smooth curve over what each frame asks
     for: the largest demand within the ease, averaged twice (thesis 5.5.1 lowers by one small amount)."""
     needed = np.zeros(len(legs[0].hip))

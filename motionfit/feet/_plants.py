@@ -45,7 +45,7 @@ class Footplants(eqx.Module):
 
     @property
     def labels(self) -> np.ndarray:
-        """"none", "left", "right" or "both" per frame."""
+        """ "none", "left", "right" or "both" per frame."""
         return np.array(LABELS)[self.planted @ np.array([1, 2])]
 
     @property

@@ -44,7 +44,7 @@ class FootFit(eqx.Module):
 
     @property
     def status(self) -> str:
-        """"converged", or "violations_left": a planted vertex still slides over 1 mm in a frame, or a foot could not
+        """ "converged", or "violations_left": a planted vertex still slides over 1 mm in a frame, or a foot could not
         reach its place; "no_progress" where no foot is ever down, so that nothing could be done. The adaptive method
         holds joints, not vertices: there only the reach counts."""
         if not self.plants.planted.any():
@@ -216,7 +216,7 @@ def remove_footskate(
     else:
         result, reachable, details = enforce(base, sole, plants, target, lift)
     if target is not None:
-        plants = eqx.tree_at(lambda p: p.floor, plants, target)
+        plants = Footplants(plants.planted, plants.vertex, plants.confidence, plants.primary, target, plants.dt)
     return FootFit(result, base, plants, method, reachable, details, sole)
 
 

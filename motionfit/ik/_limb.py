@@ -196,7 +196,6 @@ def _perpendicular(x: np.ndarray, axis: np.ndarray, fallback: np.ndarray | None 
     """The unit vector across the unit `axis` that is nearest to x; one of the coordinate axes' where x lies along it."""
     across = x - np.einsum("fa,fa->f", x, axis)[:, None] * axis
     length = np.linalg.norm(across, axis=1, keepdims=True)
-    if fallback is None:
-        other = np.eye(3)[np.abs(axis).argmin(1)]
-        fallback = other - np.einsum("fa,fa->f", other, axis)[:, None] * axis
-    return np.where(length > 1e-9, across / np.maximum(length, 1e-300), _unit(fallback))
+    other = np.eye(3)[np.abs(axis).argmin(1)]
+    other = other - np.einsum("fa,fa->f", other, axis)[:, None] * axis
+    return np.where(length > 1e-9, across / np.maximum(length, 1e-300), _unit(other if fallback is None else fallback))

@@ -177,8 +177,8 @@ def reach_picture(
     line = np.linspace(-1.1 * length, 1.1 * length, samples)
     z, y = np.meshgrid(line, line)
     targets = np.stack([y, z], axis=-1).reshape(-1, 2)
-    legs = [np.broadcast_to(v, targets.shape) for v in (thigh, shank)]
-    found = plane_angles(*legs, targets - thigh - shank)
+    upper, lower = (np.broadcast_to(v, targets.shape) for v in (thigh, shank))
+    found = plane_angles(upper, lower, targets - thigh - shank)
     # the knee's bend in the nearer solution tells the two families apart
     bend = np.arctan2(thigh[0] * shank[1] - thigh[1] * shank[0], thigh @ shank) - found.knee[0]
     shade = np.where(found.reachable, np.where(np.sin(bend) > 0, 1.0, 0.0), 0.55).reshape(z.shape)
