@@ -25,7 +25,7 @@ STEEP = 10.0  # [1/s] what a vertex that is higher than the lowest one of its fo
 SMOOTHING = 0.025  # [s] three frames at 120 frames per second
 SWITCH = 0.015  # [s] of full evidence that a change of state costs
 SLIP = 0.005  # [m] of slide that another vertex or foot must save before the weight goes over to it
-SCALES = np.geomspace(0.5, 2.0, 29)  # root path in proportion to the source's, as far as it is looked for
+SCALES = np.geomspace(0.5, 2.0, 15)  # root path in proportion to the source's, as far as it is looked for
 
 
 class Evidence(NamedTuple):
@@ -117,8 +117,8 @@ def _path_scale(calm, root, penalty, rows, size: float) -> float:
     moving = np.flatnonzero(travel > 0.4 * size)
     if len(moving) < max(10, 0.3 * len(travel)):
         return 1.0
-    # two hundred frames say as much as ten thousand; of each foot the four lowest vertices
-    some = moving[np.linspace(0, len(moving) - 1, min(len(moving), 200)).astype(int)]
+    # a hundred frames say as much as ten thousand; of each foot the four lowest vertices
+    some = moving[np.linspace(0, len(moving) - 1, min(len(moving), 100)).astype(int)]
     low = np.concatenate([mine[_lows(penalty[some][:, mine])] for mine in rows], axis=1)
     feet = np.take_along_axis(calm[some], low[..., None], axis=1)
     paid, forward = np.take_along_axis(penalty[some], low, axis=1), root[some][:, None]
@@ -187,31 +187,33 @@ def choose_vertices(
     vertices of nearly the same speed; here each stays as long as it can. Viterbi again, all plants side by side.
     """
     vertex = np.full(planted.shape, -1)
-    for foot in (0, 1):
-        mine, intervals = sole.of(foot), runs(planted[:, foot])
-        if not intervals:
-            continue
-        starts, ends = np.array(intervals).T
-        # frames of a plant count from its end, so that all plants are still there when the way back begins
-        length = int((ends - starts).max()) + 1
-        frames = ends[:, None] + 1 - length + np.arange(length)
-        inside = frames >= starts[:, None]
-        costs = evidence.cost[np.maximum(frames, 0)][:, :, mine] * dt
-        costs[~inside] = 0.0
-        total, came_from = costs[:, 0], np.empty((length, len(intervals), len(mine)), np.int32)
-        rows, same = np.arange(len(intervals)), np.arange(len(mine))
-        for step in range(1, length):
-            best = total.argmin(1)
-            switched = total[rows, best][:, None] + SLIP
-            leaves = switched < total
-            came_from[step] = np.where(leaves, best[:, None], same)
-            total = np.where(leaves, switched, total) + costs[:, step]
-        at = total.argmin(1)
-        for step in range(length - 1, -1, -1):
-            here = inside[:, step]
-            vertex[frames[here, step], foot] = sole.vertices[mine[at[here]]]
-            if step:
-                at = came_from[step, rows, at]
+    intervals = [(start, end, foot) for foot in (0, 1) for start, end in runs(planted[:, foot])]
+    if not intervals:
+        return vertex
+    starts, ends, feet = np.array(intervals).T
+    # frames of a plant count from its end, so that all plants are still there when the way back begins
+    length = int((ends - starts).max()) + 1
+    frames = ends - (length - 1) + np.arange(length)[:, None]
+    inside = frames >= starts
+    # the soles of both feet side by side: the shorter one is filled up with what nobody would choose
+    rows = [sole.of(0), sole.of(1)]
+    width = max(len(r) for r in rows)
+    table = np.stack([np.append(r, np.full(width - len(r), r[0])) for r in rows])
+    costs = evidence.cost[np.maximum(frames, 0)[..., None], table[feet]] * dt
+    costs[:, np.arange(width) >= np.array([len(r) for r in rows])[feet][:, None]] = np.inf
+    costs[~inside] = 0.0
+    total, came_from = costs[0], np.empty((length, len(intervals), width), np.int32)
+    plants, same = np.arange(len(intervals)), np.arange(width)
+    for step in range(1, length):
+        best = total.argmin(1)
+        switched = (total[plants, best] + SLIP)[:, None]
+        came_from[step] = np.where(switched < total, best[:, None], same)
+        total = np.minimum(switched, total) + costs[step]
+    at = total.argmin(1)
+    for step in range(length - 1, -1, -1):
+        here = inside[step]
+        vertex[frames[step, here], feet[here]] = sole.vertices[table[feet[here], at[here]]]
+        at = came_from[step, plants, at] if step else at
     return vertex
 
 

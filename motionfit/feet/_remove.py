@@ -12,7 +12,7 @@ from motionfit._motion import Motion
 from motionfit._onto import onto
 from motionfit._skeleton import SIDES
 from motionfit._types import InputError
-from motionfit.feet._detect import assemble, detect, gather
+from motionfit.feet._detect import Evidence, assemble, detect, gather
 from motionfit.feet._enforce import enforce
 from motionfit.feet._floor import Floor
 from motionfit.feet._leg import with_leg_ik
@@ -143,13 +143,13 @@ def _sole_for(character: Character, named) -> Sole:
     return find_sole(character, include=tuple(int(v) for v in named))
 
 
-def _plants(motion: Motion, character: Character, floor, labels) -> tuple[Footplants, Sole, np.ndarray]:
-    """Footplants, the sole they refer to, and the speeds [m/s] of its vertices."""
+def _plants(motion: Motion, character: Character, floor, labels) -> tuple[Footplants, Sole, Evidence]:
+    """Footplants, the sole they refer to, and what is known of its vertices."""
     dt, frames = float(motion.dt), motion.frame_count
     if labels is None:
         sole = _sole_for(character, ())
         plants, evidence = detect(sole, motion, _as_floor(floor))
-        return plants, sole, evidence.speed
+        return plants, sole, evidence
     known = labels if isinstance(labels, tuple) else load_labels(labels, frames, dt)
     sole = _sole_for(character, sorted({p.vertex for p in known if p.vertex is not None}))
     planted, vertex = np.zeros((frames, 2), bool), np.full((frames, 2), -1)
@@ -162,7 +162,7 @@ def _plants(motion: Motion, character: Character, floor, labels) -> tuple[Footpl
                                  f"{plant.end}); correct the label")  # fmt: skip
             vertex[plant.start : plant.end + 1, foot] = plant.vertex
     evidence = gather(sole, motion, _as_floor(floor), planted)
-    return assemble(sole, evidence, planted, planted.astype(float), dt, vertex), sole, evidence.speed
+    return assemble(sole, evidence, planted, planted.astype(float), dt, vertex), sole, evidence
 
 
 def remove_footskate(
@@ -204,10 +204,11 @@ def remove_footskate(
             raise InputError(f"footplants of {len(plants.planted)} frames for a clip of {base.frame_count}; detect "
                              "them on this clip")  # fmt: skip
         sole = _sole_for(character, np.unique(plants.vertex[plants.vertex >= 0]))
-        speed = gather(sole, base, plants.floor).speed
+        evidence = gather(sole, base, plants.floor)
     else:
-        plants, sole, speed = _plants(base, character, None, labels)
-    target, paths, rows = _as_floor(floor), sole_paths(sole, base), rows_of(sole, plants.vertex)
+        plants, sole, evidence = _plants(base, character, None, labels)
+    target, rows = _as_floor(floor), rows_of(sole, plants.vertex)
+    paths, speed = evidence.paths_world, evidence.speed
     if method == "root":
         result, details = _root(base, sole, plants, paths, rows, speed, target, vertical)
         reachable = np.ones_like(plants.planted)
