@@ -750,6 +750,20 @@ def test_command_writes_clip_report_labels_and_picture(method, monkeypatch, caps
     assert code == 0
 
 
+def test_pictures_are_drawn_without_a_display(average, tmp_path):
+    from motionfit import view
+
+    found = mf.remove_footskate(samples.walk(cycles=1), average)
+    view.sole_picture(tmp_path / "sole.png", average, found.plants)
+    view.curves_picture(tmp_path / "curves.png", average, found.base)
+    view.snapshots_picture(tmp_path / "snapshots.png", average, found, count=2)
+    view.reach_picture(tmp_path / "reach.png", np.array([-0.4, 0.1]), np.array([-0.4, -0.1]), samples=40)
+    for name in ("sole", "curves", "snapshots", "reach"):
+        assert (tmp_path / f"{name}.png").stat().st_size > 5000
+    with pytest.raises(mf.InputError, match="cannot be written"):
+        view.footprints_picture(tmp_path / "no" / "p.png", found)
+
+
 def test_command_refuses_in_one_line(monkeypatch, capsys, tmp_path):
     (tmp_path / "l.csv").write_text("nonsense\n")
     for arguments, fact in (

@@ -53,40 +53,41 @@ def footprints_picture(path: str | os.PathLike, fit: FootFit, title: str = "") -
     """The prints that the planted feet leave on the ground before and after, seen from above, with the root's path:
     thesis figures 5.5 and 5.6. A foot that slides smears its print."""
 
+    way = (np.asarray(fit.base.root, float)[-1] - np.asarray(fit.base.root, float)[0])[[0, 2]]
+    forward = way / np.linalg.norm(way) if np.linalg.norm(way) > 0.3 else np.array([0.0, 1.0])
+
+    def ground(points: np.ndarray) -> np.ndarray:
+        """Seen from above, the way to the right."""
+        x, z = points[..., 0], points[..., 2]
+        return np.stack([x * forward[0] + z * forward[1], x * forward[1] - z * forward[0]], axis=-1)
+
     def draw(figure) -> None:
         from matplotlib.collections import PolyCollection
 
-        axes = figure.subplots(1, 2, sharex=True, sharey=True)
-        way = np.asarray(fit.base.root)[-1] - np.asarray(fit.base.root)[0]
-        sideways = bool(abs(way[0]) > abs(way[2]))
+        axes = figure.subplots(2, 1, sharex=True, sharey=True)
         for ax, (name, motion, color) in zip(
             axes, (("before", fit.base, BEFORE), ("after", fit.motion, AFTER)), strict=True
         ):
             paths, root = sole_paths(fit.sole, motion), np.asarray(motion.root, float)
             # ten prints per second and foot; in between they would hide each other
             step = max(1, round(0.1 / fit.plants.dt))
-            prints = []
-            for foot in (0, 1):
-                mine = fit.sole.of(foot)
-                for frame in np.flatnonzero(fit.plants.planted[:, foot]):
-                    if frame % step == 0:
-                        prints.append(_outline(_ground(paths[frame, mine], sideways)))
+            prints = [
+                _outline(ground(paths[frame, fit.sole.of(foot)]))
+                for foot in (0, 1)
+                for frame in np.flatnonzero(fit.plants.planted[:, foot])
+                if frame % step == 0
+            ]
             ax.add_collection(PolyCollection(prints, facecolors=color, edgecolors="k", linewidths=0.4, alpha=0.25))
-            ax.plot(*_ground(root, sideways).T, color="0.4", linewidth=1, label="root")
-            measured = fit.measure(motion)
-            ax.set_title(f"{name}: planted feet slide {100 * measured['slide_path_m']:.1f} cm in all", fontsize=11)
+            ax.plot(*ground(root).T, color="0.4", linewidth=1, label="root")
+            slide = 100 * fit.measure(motion)["slide_path_m"]
+            ax.set_title(f"{name}: planted feet slide {slide:.1f} cm in all", fontsize=10)
             ax.set_aspect("equal")
-            ax.set_xlabel("m")
             ax.autoscale_view()
         axes[0].legend(fontsize=8, frameon=False)
-        figure.suptitle(title, fontsize=12)
+        axes[1].set_xlabel("m")
+        figure.suptitle(title, fontsize=11)
 
-    _save(path, (10, 7), draw)
-
-
-def _ground(points: np.ndarray, sideways: bool) -> np.ndarray:
-    """Seen from above, with the way upwards on the page."""
-    return points[..., [2, 0]] * [-1.0, 1.0] if sideways else points[..., [0, 2]] * [-1.0, 1.0]
+    _save(path, (11, 6), draw)
 
 
 def sole_picture(path: str | os.PathLike, character: Character, plants: Footplants) -> None:
@@ -168,10 +169,10 @@ def snapshots_picture(path: str | os.PathLike, character: Character, fit: FootFi
 def reach_picture(
     path: str | os.PathLike, thigh: Float[np.ndarray, "2"], shank: Float[np.ndarray, "2"], samples: int = 300
 ) -> None:
-    """Where the analytic leg reaches, and which way its knee bends there: thesis figure 3.10.
+    """Where the analytic leg reaches, and by which value of its arc sine: thesis figure 3.10.
 
-    `thigh` and `shank` [m] are the leg in its plane as (y, z), y up. Black and white are the two solutions, by which
-    of them is the nearer one; grey cannot be reached.
+    `thigh` and `shank` [m] are the leg in its plane as (y, z), y up. White where the principal value of (C.12)
+    satisfies (C.9) for the first value of (C.11), black where the other one does; grey cannot be reached.
     """
     length = float(np.linalg.norm(thigh) + np.linalg.norm(shank))
     line = np.linspace(-1.1 * length, 1.1 * length, samples)
@@ -179,9 +180,12 @@ def reach_picture(
     targets = np.stack([y, z], axis=-1).reshape(-1, 2)
     upper, lower = (np.broadcast_to(v, targets.shape) for v in (thigh, shank))
     found = plane_angles(upper, lower, targets - thigh - shank)
-    # the knee's bend in the nearer solution tells the two families apart
-    bend = np.arctan2(thigh[0] * shank[1] - thigh[1] * shank[0], thigh @ shank) - found.knee[0]
-    shade = np.where(found.reachable, np.where(np.sin(bend) > 0, 1.0, 0.0), 0.55).reshape(z.shape)
+    # (C.10): the first value of the arc sine is the one whose cosine is positive
+    k1, k = np.arctan2(shank[1], shank[0]), np.arctan2(targets[:, 0], targets[:, 1])
+    first = (np.cos(found.ankle[0] + k1 + k) < 0).astype(int)
+    hip = np.take_along_axis(found.hip, first[None], axis=0)[0]
+    principal = np.cos(hip + np.arctan2(thigh[0], thigh[1])) >= 0
+    shade = np.where(found.reachable, np.where(principal, 1.0, 0.0), 0.55).reshape(z.shape)
 
     def draw(figure) -> None:
         ax = figure.subplots()
