@@ -5,6 +5,7 @@ import pathlib
 import sys
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
@@ -25,6 +26,7 @@ from motionfit.feet import (
     find_sole,
     fit_floor,
     frame_heights,
+    hip_from_foot,
     horizontal_path,
     load_labels,
     place_at,
@@ -41,7 +43,7 @@ from motionfit.feet._enforce import descending_step, effector_path
 from motionfit.feet._plants import runs
 from motionfit.feet._transfer import evaluate, integral
 from motionfit.metrics import derivative_ratio, posed_vertices
-from tests.helpers import with_legs
+from tests.helpers import random_motion, with_legs
 
 SAME = 1e-9  # [m] "unchanged" in double precision
 ROOT = 1e-5  # closed-form roots against numpy.roots: multiple roots keep a third of the digits in both
@@ -583,6 +585,35 @@ def test_vertical_methods(average):
 
 
 # --- legs --------------------------------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 10**6))
+def test_hierarchy_that_starts_at_a_foot(seed):
+    """The hip computed from a foot puts that foot where it was asked for, with every other joint rotation the same."""
+    motion = random_motion(seed, 9, 3)
+    rng = np.random.default_rng(seed)
+    place, turn = rng.normal(size=(3, 3)), Rotation.random(3, random_state=rng).as_quat(scalar_first=True)
+    root, hip = hip_from_foot(motion, 7, place, turn)
+    moved = mf.Motion(motion.skeleton, root, np.concatenate([hip[:, None], motion.rotations[:, 1:]], axis=1), motion.dt)
+    positions, rotations = host_kinematics(moved)
+    np.testing.assert_allclose(positions[:, 7], place, atol=1e-12)
+    assert (
+        Rotation.from_quat(rotations[:, 7], scalar_first=True) * Rotation.from_quat(turn, scalar_first=True).inv()
+    ).magnitude().max() < 1e-7
+    # its own rotation: the root keeps its own too
+    own = host_kinematics(motion)[1][:, 7]
+    _, same = hip_from_foot(motion, 7, place, own)
+    np.testing.assert_allclose(np.abs((same * np.asarray(motion.rotations)[:, 0]).sum(1)), 1.0, atol=1e-12)
+
+
+def test_single_precision_agrees(average):
+    """A motion of JAX's own arrays, as a fit returns it: the rotations are still the very same object."""
+    walk = samples.walk(cycles=2)
+    single = mf.Motion(walk.skeleton, *(jnp.asarray(x, jnp.float32) for x in (walk.root, walk.rotations, walk.dt)))
+    found, double = mf.remove_footskate(single, average), mf.remove_footskate(walk, average)
+    assert found.motion.rotations is single.rotations and found.motion.root.dtype == np.float32
+    np.testing.assert_allclose(found.motion.root, double.motion.root, atol=5e-5)
+    assert found.status == "converged"
 
 
 def test_leg_ik_holds_both_feet_exactly_without_snapping(heavy):

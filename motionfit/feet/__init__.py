@@ -9,6 +9,7 @@ Thalmann 2006.
 
 from motionfit.feet._detect import Evidence, detect, gather
 from motionfit.feet._floor import Floor, fit_floor
+from motionfit.feet._leg import hip_from_foot, hold_feet
 from motionfit.feet._plants import Footplants, Plant, load_labels, save_labels
 from motionfit.feet._remove import METHODS, FootFit, measure_feet
 from motionfit.feet._root import frame_heights, horizontal_path, root_steps, scaled_heights, vertical_scale
@@ -17,7 +18,7 @@ from motionfit.feet._transfer import catmull_rom, cubic_roots, place_at, transfe
 
 __all__ = [
     "Evidence", "Floor", "FootFit", "Footplants", "METHODS", "Plant", "Sole", "catmull_rom", "cubic_roots", "detect",
-    "find_sole", "fit_floor", "frame_heights", "gather", "horizontal_path", "load_labels",
+    "find_sole", "fit_floor", "frame_heights", "gather", "hip_from_foot", "hold_feet", "horizontal_path", "load_labels",
     "measure_feet", "place_at", "root_steps", "save_labels", "scaled_heights", "sole_paths",
     "transfer_instant", "vertical_scale",
 ]  # fmt: skip

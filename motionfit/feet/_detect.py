@@ -89,7 +89,8 @@ def gather(
     for mine in rows:
         heights = paths[:, mine, 1]
         above_lowest[:, mine] = heights - heights.min(1, keepdims=True)
-    root = velocity(smooth(np.asarray(motion.root, float) - motion.root[0], smoothing_frames(dt)), dt)
+    root = np.asarray(motion.root, float)
+    root = velocity(smooth(root - root[:1], smoothing_frames(dt)), dt)
     root[:, 1] = 0.0
     penalty = STEEP * np.maximum(above_lowest - 0.005 * size, 0.0)
     scale = _path_scale(calm, root, penalty, rows, size)

@@ -44,6 +44,22 @@ class Leg(NamedTuple):
         return np.linalg.norm(self.knee - self.hip, axis=1) + np.linalg.norm(self.ankle - self.knee, axis=1)
 
 
+def hip_from_foot(
+    motion: Motion, joint: int, place_world: Float[np.ndarray, "frames 3"], turn_world: Float[np.ndarray, "frames 4"]
+) -> tuple[Float[np.ndarray, "frames 3"], Float[np.ndarray, "frames 4"]]:
+    """Root position [m] and rotation for which a joint is where and turned as it should be: figure 3.7, the hierarchy
+    that starts at a foot. No joint is turned against its neighbour.
+
+    With the joint's own world rotation (`currentRotation` of the algorithm in 3.2.1) the root keeps its rotation,
+    and moves by as much as the foot has to.
+    """
+    positions, rotations = host_kinematics(motion)
+    root, foot = (Rotation.from_quat(rotations[:, j], scalar_first=True) for j in (0, joint))
+    turned = Rotation.from_quat(turn_world, scalar_first=True) * foot.inv()
+    place = place_world + turned.apply(positions[:, 0] - positions[:, joint])
+    return place, (turned * root).as_quat(scalar_first=True)
+
+
 def find_legs(skeleton: Skeleton, positions: np.ndarray, rotations: np.ndarray) -> list[Leg]:
     """Both legs of a motion whose world kinematics are given. The knee's axis is the one about which the shank bends
     over the clip, fixed in the thigh; a leg that never bends takes the character's left-right axis at bind."""

@@ -149,7 +149,7 @@ def chain_kinematics(
             joint = parents[joint]
     offsets = np.asarray(motion.skeleton.offsets, float)
     order = sorted(needed)
-    local = _matrix(np.asarray(motion.rotations[:, np.array(order)], float))
+    local = _matrix(np.asarray(motion.rotations)[:, order].astype(float))
     world: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     for k, joint in enumerate(order):
         parent = parents[joint]
