@@ -47,6 +47,11 @@ class Character(eqx.Module):
                 raise InputError(f"{self.name}: the skin names joint {int(used.max())}, but there are {joints}")
 
     @cached_property
+    def memo(self) -> dict:
+        """What was fitted once to this very character on the host."""
+        return {}
+
+    @cached_property
     def part_of_vertex(self) -> Int[np.ndarray, " vertices"]:
         """Index into `PARTS` of each vertex, by its joint of greatest weight."""
         of_joint = np.array([PARTS.index(part_of_joint(self.skeleton, j)) for j in range(len(self.skeleton.names))])

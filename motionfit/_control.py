@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from motionfit import rotation
 from motionfit._motion import Motion
@@ -19,9 +19,12 @@ from motionfit.splines import Basis
 
 class Drive(eqx.Module):
     """One joint that a control turns: `axis_parent` in the joint's *parent's* frame, unit, one for all frames or
-    one per frame, and a gain (-1 for the mirrored thigh, for the head that undoes the hip)."""
+    one per frame, and a gain (-1 for the mirrored thigh, for the head that undoes the hip).
 
-    joint: int = eqx.field(static=True)
+    The joint is an index array, not static: the left and the right arm share one compiled program.
+    """
+
+    joint: Int[AnyArray, ""] = eqx.field(converter=lambda x: np.asarray(x, np.int32) if isinstance(x, int) else x)
     axis_parent: Float[AnyArray, "*frames 3"]
     gain: Float[AnyArray, ""] = eqx.field(converter=lambda x: np.asarray(x, float) if isinstance(x, float | int) else x)
 
@@ -56,17 +59,16 @@ def turned(
     The rotation vectors of all drives of a joint are summed before the exponential: their order does not matter,
     and where all of them are zero the motion's own rotation comes back bit for bit.
     """
-    vectors: dict[int, Array] = {}
+    rotations = jnp.asarray(motion.rotations)
+    if not any(control.drives for control in controls):
+        return rotations
+    vectors = jnp.zeros((*rotations.shape[:2], 3), rotations.dtype)
     for k, control in enumerate(controls):
         for drive in control.drives:
             push = (signals[:, k] * drive.gain)[:, None] * jnp.asarray(drive.axis_parent).reshape(-1, 3)
-            vectors[drive.joint] = vectors[drive.joint] + push if drive.joint in vectors else push
-    rotations = jnp.asarray(motion.rotations)
-    if not vectors:
-        return rotations
-    joints = np.array(sorted(vectors))
-    delta = rotation.exp(jnp.stack([vectors[j] for j in joints.tolist()], axis=1))
-    return rotations.at[:, joints].set(rotation.multiply(delta, rotations[:, joints]))
+            vectors = vectors.at[:, jnp.asarray(drive.joint)].add(push.astype(rotations.dtype))
+    # exp(0) is the identity exactly, and multiplying by it changes no bit
+    return rotation.multiply(rotation.exp(vectors), rotations)
 
 
 class Correction(eqx.Module):
@@ -115,7 +117,7 @@ class Correction(eqx.Module):
         arrays, described = {}, []
         for k, (control, points) in enumerate(zip(self.controls, self.points, strict=True)):
             described.append({"name": control.name, "count": control.basis.count,
-                              "joints": [d.joint for d in control.drives]})  # fmt: skip
+                              "joints": [int(d.joint) for d in control.drives]})  # fmt: skip
             arrays |= {f"{k}.points": points, f"{k}.first": control.basis.first, f"{k}.values": control.basis.values,
                        f"{k}.lower": control.lower, f"{k}.upper": control.upper}  # fmt: skip
             for i, drive in enumerate(control.drives):

@@ -1,8 +1,10 @@
 """Block-coordinate descent over optimistix solvers, and nothing else: thesis 4.3.1."""
 
+import dataclasses
 import json
 import time
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,12 +13,13 @@ import lineax as lx
 import numpy as np
 import optimistix as optx
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from motionfit._control import Correction
+from motionfit._control import Control, Correction
 from motionfit._motion import Motion
-from motionfit._problem import Energy, Problem, Term, term_cost
-from motionfit._types import InputError
+from motionfit._problem import Custom, Energy, Objective, Problem, Term, term_cost
+from motionfit._types import AnyArray, InputError
+from motionfit.banded import Banded
 
 # `SUCCEEDED` and the like are what reports print; the advice stands with the word
 STATUS_ADVICE = {
@@ -93,14 +96,12 @@ class Fit(eqx.Module):
         return json.dumps(self.report(), indent=2)
 
 
-def levenberg_marquardt(rtol: float = 1e-4, atol: float = 1e-6) -> optx.LevenbergMarquardt:
-    """The default solver. Its dense normal equations are factorised by Cholesky: the damping keeps them definite,
-    and a tall QR of the same system takes several times longer."""
-    return optx.LevenbergMarquardt(rtol=rtol, atol=atol, linear_solver=lx.Normal(lx.Cholesky()))
-
-
-# optimistix's default adjoint calls a system singular where a control cannot be observed (no frame in contact)
-ADJOINT = optx.ImplicitAdjoint(linear_solver=lx.AutoLinearSolver(well_posed=False))
+def levenberg_marquardt(
+    linear_solver: lx.AbstractLinearSolver | None = None, rtol: float = 1e-4, atol: float = 1e-5
+) -> optx.LevenbergMarquardt:
+    """The default solver. Without a `Banded` solver its normal equations are dense and factorised by Cholesky: the
+    damping keeps them definite, and a tall QR of the same system takes several times longer."""
+    return optx.LevenbergMarquardt(rtol=rtol, atol=atol, linear_solver=linear_solver or lx.Normal(lx.Cholesky()))
 
 
 @eqx.filter_custom_jvp
@@ -118,12 +119,14 @@ def _frame_local_rows(signals: Float[Array, "frames controls"], rows: Callable) 
 def _frame_local_rows_jvp(primals, tangents):
     signals, rows = primals
     t_signals, t_rows = tangents
-    value = rows(signals)
-    tangent = jnp.zeros_like(value)
     if t_signals is not None:
         seeds = jnp.eye(signals.shape[1], dtype=signals.dtype)[:, None, :] * jnp.ones_like(signals)
-        _, columns = jax.vmap(lambda seed: jax.jvp(rows, (signals,), (seed,)))(seeds)
-        tangent = tangent + jnp.einsum("tc,ctn->tn", t_signals, columns)
+        product = jax.vmap(lambda seed: jax.jvp(rows, (signals,), (seed,)), out_axes=(None, 0))
+        value, columns = product(seeds)
+        tangent = jnp.einsum("tc,ctn->tn", t_signals, columns)
+    else:
+        value = rows(signals)
+        tangent = jnp.zeros_like(value)
     if any(leaf is not None for leaf in jax.tree.leaves(t_rows)):
         _, extra = eqx.filter_jvp(lambda r: r(signals), (rows,), (t_rows,))
         tangent = tangent + extra
@@ -133,55 +136,152 @@ def _frame_local_rows_jvp(primals, tangents):
 class _Rows(eqx.Module):
     """The weighted residuals of some terms as a function of the signals of the free controls."""
 
-    problem: Problem
+    objective: Objective
     fixed: Float[Array, "frames controls"]  # signals of all controls; the free columns are replaced
-    free: tuple[int, ...] = eqx.field(static=True)
-    terms: tuple[str, ...] = eqx.field(static=True)
+    free: Int[Array, " free"]
+    terms: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, signals: Float[Array, "frames free"]) -> Float[Array, "frames n"]:
-        all_signals = self.fixed.at[:, np.array(self.free)].set(signals)
-        kin = self.problem.kinematics(all_signals)
+        kin = self.objective.kinematics(self.fixed.at[:, self.free].set(signals))
         frames = signals.shape[0]
         rows = [
-            jnp.sqrt(self.problem.weights[k]) * self.problem.terms[k].residual(kin).reshape(frames, -1)  # type: ignore
+            jnp.sqrt(self.objective.weights[k]) * self.objective.terms[k].residual(kin).reshape(frames, -1)  # type: ignore
             for k in self.terms
         ]
-        return jnp.concatenate(rows, axis=1) if rows else jnp.zeros((frames, 0))
+        return jnp.concatenate(rows, axis=1) if rows else jnp.zeros((frames, 0), signals.dtype)
 
 
-def _free_signals(problem: Problem, free: tuple[int, ...], points: tuple[Array, ...]) -> Float[Array, "frames free"]:
-    return jnp.stack([problem.controls[k].signal(p) for k, p in zip(free, points, strict=True)], axis=1)
+class Work(NamedTuple):
+    """One block's solve as arrays: what is fixed, what is free, and where the free controls start."""
+
+    objective: Objective
+    controls: tuple[Control, ...]  # the free ones
+    free: Int[AnyArray, " free"]  # their places among all: data, not structure
+    start: tuple[Array, ...]  # their control points
+    points: tuple[Array, ...]  # of all controls
+
+
+class Solved(NamedTuple):
+    points: tuple[Array, ...]  # of the free controls
+    before: tuple[Array, ...]  # cost of each term
+    after: tuple[Array, ...]
+    steps: Array
+    converged: Array
+
+
+def solve_block(work: Work, solver, max_steps: int, adjoint: optx.AbstractAdjoint) -> Solved:
+    """Run one block's solver; a pure function of arrays, to be jitted, vmapped or differentiated."""
+    objective = work.objective
+    fixed = objective.signals(work.points)
+    start = work.start
+    terms = range(len(objective.terms))
+    least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
+
+    def signals_of(x, controls):
+        return jnp.stack([c.signal(p) for c, p in zip(controls, x, strict=True)], axis=1)
+
+    def residuals(x, args):
+        objective, controls, free, fixed = args
+        signals = signals_of(x, controls)
+        local = tuple(k for k in terms if objective.terms[k].reach == 0)
+        other = tuple(k for k in terms if objective.terms[k].reach != 0)
+        return (_frame_local_rows(signals, _Rows(objective, fixed, free, local)),
+                _Rows(objective, fixed, free, other)(signals))  # fmt: skip
+
+    def costs(x, args):
+        objective, controls, free, fixed = args
+        kin = objective.kinematics(fixed.at[:, free].set(signals_of(x, controls)))
+        return tuple(w * term_cost(t, kin) for t, w in zip(objective.terms, objective.weights, strict=True))
+
+    arguments = (objective, work.controls, jnp.asarray(work.free), fixed)
+    options = {"max_steps": max_steps, "throw": False, "adjoint": adjoint}
+    if least_squares:
+        solution = optx.least_squares(residuals, solver, start, arguments, **options)
+    else:
+        solution = optx.minimise(lambda x, args: sum(costs(x, args)), solver, start, arguments, **options)
+    both = jax.tree.map(lambda a, b: jnp.stack([a, b]), start, solution.value)
+    before_after = jax.lax.map(lambda x: costs(x, arguments), both)
+    steps = getattr(solution.state, "num_accepted_steps", solution.stats["num_steps"])
+    return Solved(solution.value, tuple(c[0] for c in before_after), tuple(c[1] for c in before_after), steps,
+                  solution.result == optx.RESULTS.successful)  # fmt: skip
+
+
+_solve = eqx.filter_jit(solve_block)
+
+
+def block_solver(problem: Problem, block: Block):
+    """The solver of a block: its own, or Levenberg-Marquardt, banded in time where its terms' reach is known."""
+    if block.solver is not None:
+        return block.solver
+    banded = banded_solver(problem, block)
+    return levenberg_marquardt(banded)
+
+
+def banded_solver(problem: Problem, block: Block) -> Banded | None:
+    """The linear solver that suits a block; None where a term may look anywhere or the free controls have bases of
+    their own."""
+    bases = [c.basis for c in problem.controls if c.name in block.controls]
+    same = all(b.count == bases[0].count and np.array_equal(b.first, bases[0].first) for b in bases[1:])
+    terms = problem.terms if block.terms is None else block.terms
+    reaches = [problem.terms[k].reach for k in terms if isinstance(problem.terms[k], Term)]  # type: ignore
+    if not same or any(r is None for r in reaches):
+        return None
+    return Banded.of(bases[0], max(reaches, default=0))
+
+
+# optimistix's default adjoint calls a system singular where a control cannot be observed (no frame in contact)
+def block_adjoint(solver) -> optx.ImplicitAdjoint:
+    """Implicit derivatives through a solve, by the block's own banded solver where it has one."""
+    inner = getattr(getattr(solver, "descent", None), "linear_solver", None)
+    return optx.ImplicitAdjoint(inner if isinstance(inner, Banded) else lx.AutoLinearSolver(well_posed=False))
 
 
 @eqx.filter_jit
-def _solve(problem: Problem, block: Block, points: tuple[Array, ...], free: tuple[int, ...], terms: tuple[str, ...]):
-    """Run one block's solver. Only arrays come back: optimistix's Solution holds leaves that are not."""
-    fixed = jnp.stack([c.signal(p) for c, p in zip(problem.controls, points, strict=True)], axis=1)
-    is_local = {k: isinstance(problem.terms[k], Term) and problem.terms[k].frame_local for k in terms}  # type: ignore
-    start = tuple(points[k] for k in free)
-    residual_terms = tuple(k for k in terms if isinstance(problem.terms[k], Term))
+def _reach_errors(work: Work, reaches: tuple[int, ...], solver: Banded) -> tuple[Array, ...]:
+    """How far each term's Jacobian is from the one that its reach allows, relative to its largest row."""
+    del reaches
+    objective = work.objective
+    start = work.start
+    fixed = objective.signals(work.points)
+    points = start[0].shape[0]
+    count = len(start)
+    # pseudo-random, so that no cancellation hides a row that reaches too far
+    probe = tuple(jnp.sin(12.9898 * (k + 1) + 78.233 * jnp.arange(points) ** 1.5) for k in range(count))
+    probe = tuple(p.astype(s.dtype) for p, s in zip(probe, start, strict=True))
+    errors = []
+    for k in range(len(objective.terms)):
 
-    def residuals(x, args):
-        problem, fixed = args
-        signals = _free_signals(problem, free, x)
-        local = _Rows(problem, fixed, free, tuple(k for k in residual_terms if is_local[k]))
-        other = _Rows(problem, fixed, free, tuple(k for k in residual_terms if not is_local[k]))
-        return _frame_local_rows(signals, local), other(signals)
+        def rows(x, k=k):
+            signals = jnp.stack([c.signal(p) for c, p in zip(work.controls, x, strict=True)], axis=1)
+            return _Rows(objective, fixed, work.free, (k,))(signals)
 
-    def total(x, args):
-        problem, fixed = args
-        kin = problem.kinematics(fixed.at[:, np.array(free)].set(_free_signals(problem, free, x)))
-        return sum(problem.weights[k] * term_cost(problem.terms[k], kin) for k in terms)
+        value, product = jax.linearize(rows, start)
+        operator = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: start))
+        (columns,) = solver.columns(operator, count, points, solver.width)
+        windows = solver.windows(columns.reshape(*columns.shape[:2], -1), count)
+        # the rows that the windows allow, times the probe, against the product itself
+        stacked = jnp.stack(probe, axis=1)
+        place = jnp.minimum(jnp.arange(points)[:, None] + jnp.arange(solver.width), points - 1)
+        seen = stacked[place].reshape(points, -1)
+        allowed = jnp.einsum("kin,ki->kn", windows, seen).reshape(points, solver.frames_of.shape[1], -1)
+        exact = product(probe).reshape(value.shape[0], -1)
+        exact = jnp.pad(exact, ((0, 1), (0, 0)))[jnp.asarray(solver.frames_of)]
+        errors.append(jnp.max(jnp.abs(exact - allowed), initial=0.0) / (jnp.max(jnp.abs(exact), initial=0.0) + 1e-12))
+    return tuple(errors)
 
-    solver = levenberg_marquardt() if block.solver is None else block.solver
-    options = {"max_steps": block.max_steps, "throw": False, "adjoint": ADJOINT}
-    arguments = (problem, fixed)
-    if isinstance(solver, optx.AbstractLeastSquaresSolver):
-        solution = optx.least_squares(residuals, solver, start, arguments, **options)
-    else:
-        solution = optx.minimise(total, solver, start, arguments, **options)
-    steps = getattr(solution.state, "num_accepted_steps", solution.stats["num_steps"])
-    return solution.value, steps, solution.result == optx.RESULTS.successful
+
+def check_reach(problem: Problem, block: Block, work: Work) -> None:
+    """Find out a `Custom` term whose declared reach is wrong, before it quietly spoils every step of the solve."""
+    names = tuple(problem.terms) if block.terms is None else block.terms
+    declared = [k for k in names if isinstance(problem.terms[k], Custom) and problem.terms[k].reach is not None]
+    bases = [c.basis for c in problem.controls if c.name in block.controls]
+    for name in declared:
+        reach = problem.terms[name].reach  # type: ignore
+        alone = work._replace(objective=problem.objective((name,)))
+        (error,) = _reach_errors(alone, (reach,), Banded.of(bases[0], reach))
+        if float(error) > 1e-3:
+            raise InputError(f"term {name!r} says reach={reach}, but its rows depend on frames further away than that; "
+                             "give mf.Custom(fn, args, reach=R) the R that it needs, or leave reach out")  # fmt: skip
 
 
 def fit(
@@ -201,33 +301,19 @@ def fit(
     names = [c.name for c in problem.controls]
     for block in blocks:
         _check(block, problem, names)
-    points = tuple(jnp.asarray(p) for p in (correction or Correction.zero(problem.controls)).points)
-    costs = problem.costs(Correction(problem.controls, points))
+    points = tuple(jnp.asarray(p, float) for p in (correction or Correction.zero(problem.controls)).points)
     history: list[BlockReport] = []
     for sweep in range(sweeps):
         for i, block in enumerate(blocks):
             started = time.perf_counter()
-            free = tuple(names.index(c) for c in block.controls)
             terms = tuple(problem.terms) if block.terms is None else block.terms
-            before = costs
-            value, steps, converged = _solve(problem, block, points, free, terms)
-            changed = list(points)
-            for k, new in zip(free, value, strict=True):
-                changed[k] = new
-            costs = problem.costs(Correction(problem.controls, tuple(changed)))
-            cost_before, cost_after = (sum(c[k] for k in terms) for c in (before, costs))
-            # the best iterate: a solver that broke down (NaN, a higher cost) must not make the motion worse
-            if cost_after <= cost_before:
-                points = tuple(changed)
-            else:
-                costs, cost_after = before, cost_before
-            status = _status(cost_before, cost_after, int(steps), bool(converged))
-            history.append(
-                BlockReport(
-                    block.name, sweep, status, int(steps), cost_before, cost_after,
-                    {k: before[k] for k in terms}, {k: costs[k] for k in terms}, time.perf_counter() - started,
-                )
-            )  # fmt: skip
+            work = block_work(problem, block, points)
+            if sweep == 0:
+                check_reach(problem, block, work)
+            solver = block_solver(problem, block)
+            solved = _solve(work, solver, block.max_steps, block_adjoint(solver))
+            points, report = settle(block, terms, points, work, jax.device_get(solved), sweep)
+            history.append(dataclasses.replace(report, time_s=time.perf_counter() - started))
             if progress is not None:
                 progress(block.name, sweep * len(blocks) + i + 1, sweeps * len(blocks))
     result = Correction(problem.controls, points)
@@ -236,6 +322,33 @@ def fit(
     if status == "converged" and "max_steps" in last.values():
         status = "violations_left"
     return Fit(result, result.apply(problem.motion), problem.motion, status, tuple(history), problem)
+
+
+def block_work(problem: Problem, block: Block, points: tuple[Array, ...]) -> Work:
+    """A block's solve as arrays, from the control points so far."""
+    objective = problem.objective(block.terms)
+    free = [k for k, c in enumerate(problem.controls) if c.name in block.controls]
+    free.sort(key=lambda k: block.controls.index(problem.controls[k].name))
+    return Work(objective, tuple(objective.controls[k] for k in free), np.array(free), tuple(points[k] for k in free), points)
+
+
+def settle(
+    block: Block, terms: tuple[str, ...], points: tuple[Array, ...], work: Work, solved: Solved, sweep: int
+) -> tuple[tuple[Array, ...], BlockReport]:
+    """The control points after a block, and its report; the old ones where the solver made things worse or broke
+    down (NaN)."""
+    before, after = ({k: float(v) for k, v in zip(terms, c, strict=True)} for c in (solved.before, solved.after))
+    cost_before, cost_after = sum(before.values()), sum(after.values())
+    if cost_after <= cost_before:
+        changed = list(points)
+        for k, new in zip(np.asarray(work.free).tolist(), solved.points, strict=True):
+            changed[k] = jnp.asarray(new)
+        points = tuple(changed)
+    else:
+        after, cost_after = before, cost_before
+    status = _status(cost_before, cost_after, int(solved.steps), bool(solved.converged))
+    report = BlockReport(block.name, sweep, status, int(solved.steps), cost_before, cost_after, before, after, 0.0)
+    return points, report
 
 
 def _status(cost_before: float, cost_after: float, steps: int, converged: bool) -> str:

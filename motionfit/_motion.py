@@ -1,6 +1,7 @@
 """A motion over time, and the kinematics that everything else reads."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -50,6 +51,19 @@ class Motion(eqx.Module):
 def rest_motion(skeleton: Skeleton, dt: float = 1 / 60) -> Motion:
     """One frame in the bind pose."""
     return Motion(skeleton, skeleton.offsets[:1], skeleton.rest_rotations[None], dt)
+
+
+def bucket(frame_count: int) -> int:
+    """The least of 16, 24, 32, 48, 64, 96, ... that is not below: clips of one bucket share a compiled program."""
+    size = 16
+    while size < frame_count:
+        size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
+    return size
+
+
+def padded(motion: Motion, frame_count: int) -> Motion:
+    """The motion with its last frame repeated up to `frame_count` frames."""
+    return motion[np.minimum(np.arange(frame_count), motion.frame_count - 1)]
 
 
 def resample(motion: Motion, frame_rate: float) -> Motion:
@@ -105,47 +119,51 @@ def forward_kinematics(
 
     Level by level over the static tree: all joints of one depth are turned at once, each quaternion component
     being a (joints of the level, frames) array. For 31 joints this is some fifty times faster on the CPU than
-    one joint after the other, since the work is in long contiguous vectors, and the program that XLA sees
-    grows with the depth of the tree instead of its size. The bind pose rides along as one more frame.
+    one joint after the other, since the work is in long contiguous vectors. The levels are padded to one width and
+    scanned, so that the program that XLA compiles is one level's, whatever the tree. The bind pose rides along as one
+    more frame.
     """
     frames = motion.root.shape[0]
     rotations = jnp.asarray(motion.rotations)
     offsets, rest = jnp.asarray(skeleton.offsets), jnp.asarray(skeleton.rest_rotations)
     dtype = rotations.dtype
-    local = jnp.moveaxis(jnp.concatenate([rotations, rest[None].astype(dtype)]), 0, -1)  # (joints, 4, frames + 1)
-    root = jnp.concatenate([jnp.asarray(motion.root), offsets[:1]]).astype(dtype)
-    levels = skeleton.levels
-    # components of the level above: rotation 4 x (level, frames), position 3 x (level, frames)
-    q = tuple(local[:1, i] for i in range(4))
-    p = tuple(root[:, i][None] for i in range(3))
-    all_q, all_p = [jnp.stack(q, -1)], [jnp.stack(p, -1)]
-    for above, level in zip(levels, levels[1:], strict=False):
-        parent = np.array([above.index(skeleton.parents[j]) for j in level])
-        joints = np.array(level)
-        aw, ax, ay, az = (c[parent] for c in q)
-        px, py, pz = (c[parent] for c in p)
-        vx, vy, vz = (offsets[joints, i][:, None] for i in range(3))
-        if motion.translations is not None:
-            moving = jnp.asarray(motion.translations)[:, joints]
-            vx, vy, vz = (jnp.concatenate([moving[..., i].T, offsets[joints, i][:, None]], axis=1) for i in range(3))
-        bw, bx, by, bz = (local[joints, i] for i in range(4))
-        q = (
+    local = jnp.transpose(jnp.concatenate([rotations, rest[None].astype(dtype)]), (2, 1, 0))  # (4, joints, frames + 1)
+    root = jnp.concatenate([jnp.asarray(motion.root), offsets[:1]]).astype(dtype).T[:, None]
+    joints, parents, places = _padded_levels(skeleton)
+    places_parent = offsets.astype(dtype).T[:, :, None]  # (3, joints, 1)
+    if motion.translations is not None:
+        moving = jnp.transpose(jnp.asarray(motion.translations).astype(dtype), (2, 1, 0))
+        places_parent = jnp.concatenate([moving, places_parent], axis=2)
+
+    def level(above, at):
+        (aw, ax, ay, az), (px, py, pz) = ((*x,) for x in above)
+        (bw, bx, by, bz), (vx, vy, vz), parent = at
+        aw, ax, ay, az, px, py, pz = (c[parent] for c in (aw, ax, ay, az, px, py, pz))
+        tx, ty, tz = 2 * (ay * vz - az * vy), 2 * (az * vx - ax * vz), 2 * (ax * vy - ay * vx)
+        q = jnp.stack([
             aw * bw - ax * bx - ay * by - az * bz,
             aw * bx + ax * bw + ay * bz - az * by,
             aw * by - ax * bz + ay * bw + az * bx,
             aw * bz + ax * by - ay * bx + az * bw,
-        )
-        tx, ty, tz = 2 * (ay * vz - az * vy), 2 * (az * vx - ax * vz), 2 * (ax * vy - ay * vx)
-        p = (
+        ])  # fmt: skip
+        p = jnp.stack([
             px + vx + aw * tx + ay * tz - az * ty,
             py + vy + aw * ty + az * tx - ax * tz,
             pz + vz + aw * tz + ax * ty - ay * tx,
-        )
-        all_q.append(jnp.stack(q, -1))
-        all_p.append(jnp.stack(p, -1))
-    order = np.argsort(np.concatenate([np.array(level) for level in levels]))
-    positions = jnp.moveaxis(jnp.concatenate(all_p)[order], 0, 1)
-    turned = jnp.moveaxis(jnp.concatenate(all_q)[order], 0, 1)
+        ])  # fmt: skip
+        return (q, p), (q, p)
+
+    width = joints.shape[1]
+    top = local[:, :1], root
+    wide = tuple(jnp.repeat(x, width, axis=1) for x in top)
+    below = (jnp.moveaxis(local[:, joints], 0, 1), jnp.moveaxis(places_parent[:, joints], 0, 1), parents)
+    _, levels = jax.lax.scan(level, wide, below)
+    # (levels, components, width, frames) -> (frames, joints, components), the root first
+    turned, positions = (
+        jnp.concatenate([first, jnp.moveaxis(x, 1, 0).reshape(len(first), -1, frames + 1)[:, places]], axis=1)
+        for first, x in zip(top, levels, strict=True)
+    )
+    turned, positions = jnp.transpose(turned, (2, 1, 0)), jnp.transpose(positions, (2, 1, 0))
     skin_rotations = rotation.to_matrix(rotation.multiply(turned[:-1], rotation.conjugate(turned[-1:])))
     return Kinematics(
         positions_world=positions[:-1],
@@ -156,6 +174,20 @@ def forward_kinematics(
         dt=jnp.asarray(motion.dt),
         signals=jnp.zeros((frames, 0), dtype) if signals is None else signals,
     )
+
+
+def _padded_levels(skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Joints of every level below the root, padded to one width; their parents' places in the level above; and the
+    place of every joint but the root in the flattened levels."""
+    levels = skeleton.levels
+    width = max(len(level) for level in levels)
+    joints, parents = (np.zeros((len(levels) - 1, width), np.int32) for _ in range(2))
+    places = np.zeros(len(skeleton.parents), np.int32)
+    for k, (above, level) in enumerate(zip(levels, levels[1:], strict=False)):
+        joints[k, : len(level)] = level
+        parents[k, : len(level)] = [above.index(skeleton.parents[j]) for j in level]
+        places[list(level)] = k * width + np.arange(len(level))
+    return joints, parents, places[1:]
 
 
 def host_kinematics(

@@ -1,7 +1,8 @@
 """An adaptation problem is data: a character, a base motion, controls, named terms and weights."""
 
 import abc
-from collections.abc import Callable, Mapping
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 
 import equinox as eqx
 import jax
@@ -13,6 +14,7 @@ from jaxtyping import Float, PyTree
 from motionfit._character import Character
 from motionfit._control import Control, Correction, turned
 from motionfit._motion import Kinematics, Motion, forward_kinematics
+from motionfit._skeleton import Skeleton
 from motionfit._types import AnyArray, InputError
 
 
@@ -25,14 +27,15 @@ class Term(eqx.Module):
     """A wish about the motion, as residuals over Kinematics.
 
     `residual` is dimensionless: divided by a `sigma` that carries the unit ("5 mm counts as 1"). Its leading axis
-    are the frames. A term is *frame-local* when its row of frame t depends on the kinematics of frame t alone;
-    then the fit needs one Jacobian product per control instead of one per control point. Velocities,
-    accelerations and the like are not: they say `frame_local = False`.
+    are the frames. `reach` says how far a row looks in time: row t depends on the kinematics of the frames
+    t - reach .. t + reach alone (0: its own frame; velocities and accelerations by central differences: 1). The fit
+    then costs a handful of products per control and time linear in the clip's length. None: it may look anywhere,
+    and the block that it stands in is solved densely.
     """
 
     @property
-    def frame_local(self) -> bool:
-        return True
+    def reach(self) -> int | None:
+        return 0
 
     @abc.abstractmethod
     def residual(self, kin: Kinematics) -> Float[Array, "frames ..."]:
@@ -42,17 +45,22 @@ class Term(eqx.Module):
 class Custom(Term):
     """A term from a plain function: `fn(kin, args) -> residual (frames, ...)`.
 
-    Data goes in `args` (numbers become arrays there), so that a new value does not recompile. Since the function
-    may look at neighbouring frames it is not taken for frame-local unless `frame_local=True` says so.
+    Data goes in `args` (numbers become arrays there), so that a new value does not recompile. Since the function may
+    look at any frame, its `reach` is None unless it is given; a wrong one is found out when the term is fitted.
     """
 
     fn: Callable = eqx.field(static=True)
     args: PyTree = eqx.field(converter=lambda tree: jax.tree.map(_array, tree), default=None)
-    local: bool = eqx.field(static=True, default=False)
+    frames_around: int | None = eqx.field(static=True)
+
+    def __init__(self, fn: Callable, args: PyTree = None, *, reach: int | None = None):
+        if reach is not None and reach < 0:
+            raise InputError(f"reach counts frames on each side of a row and cannot be {reach}; give 0, 1, ... or None")
+        self.fn, self.args, self.frames_around = fn, args, reach
 
     @property
-    def frame_local(self) -> bool:
-        return self.local
+    def reach(self) -> int | None:
+        return self.frames_around
 
     def residual(self, kin: Kinematics) -> Float[Array, "frames ..."]:
         return self.fn(kin, self.args)
@@ -75,8 +83,8 @@ class During(Term):
     mask: Float[AnyArray, " frames"]
 
     @property
-    def frame_local(self) -> bool:
-        return self.term.frame_local
+    def reach(self) -> int | None:
+        return self.term.reach
 
     def residual(self, kin: Kinematics) -> Float[Array, "frames ..."]:
         rows = self.term.residual(kin)
@@ -93,8 +101,8 @@ class Robust(Term):
     c: Float[AnyArray, ""] = eqx.field(converter=_array, default=2.0)
 
     @property
-    def frame_local(self) -> bool:
-        return self.term.frame_local
+    def reach(self) -> int | None:
+        return self.term.reach
 
     def residual(self, kin: Kinematics) -> Float[Array, "frames ..."]:
         scaled = self.term.residual(kin) / self.c
@@ -136,20 +144,21 @@ class Problem(eqx.Module):
         self.character, self.motion, self.terms, self.controls = character, motion, dict(terms), tuple(controls)
         self.weights = {k: _array((weights or {}).get(k, 1.0)) for k in terms}
 
+    def objective(self, terms: Sequence[str] | None = None) -> "Objective":
+        """What a solver sees of some terms (None: all): arrays without names, and without the skin."""
+        names = tuple(self.terms) if terms is None else tuple(terms)
+        controls = tuple(dataclasses.replace(c, name="") for c in self.controls)
+        return Objective(self.character.skeleton, self.motion, controls, tuple(self.terms[k] for k in names),
+                         tuple(self.weights[k] for k in names))  # fmt: skip
+
     def kinematics(self, signals: Float[AnyArray, "frames controls"] | None = None) -> Kinematics:
         """Forward kinematics of the base motion with control signals [rad] on top (None: the base motion)."""
-        motion = self.motion
-        if signals is not None and self.controls:
-            rotations = turned(motion, self.controls, signals)
-            motion = Motion(motion.skeleton, motion.root, rotations, motion.dt, motion.translations)
-        else:
-            signals = jnp.zeros((motion.root.shape[0], len(self.controls)))
-        return forward_kinematics(self.character.skeleton, motion, signals)
+        return self.objective(()).kinematics(signals)
 
     def costs(self, correction: Correction | None = None) -> dict[str, float]:
         """The weighted cost of each term, 1/2 w sum r^2 or w E."""
-        values = _costs(self, None if correction is None else correction.points)
-        return {k: float(v) for k, v in values.items()}
+        points = tuple(jnp.asarray(p) for p in (correction or Correction.zero(self.controls)).points)
+        return {k: float(v) for k, v in zip(self.terms, _costs(self.objective(), points), strict=True)}
 
     def report(self, correction: Correction | None = None) -> str:
         """A table of the terms: weight, cost and the frame where it is worst."""
@@ -165,13 +174,40 @@ class Problem(eqx.Module):
         return "\n".join(lines)
 
 
+class Objective(eqx.Module):
+    """Skeleton, base motion, controls, terms and weights: a problem stripped of names, so that blocks of equal
+    structure, such as the left and the right arm, share one compiled program whatever character they belong to."""
+
+    skeleton: Skeleton
+    motion: Motion
+    controls: tuple[Control, ...]
+    terms: tuple[Term | Energy, ...]
+    weights: tuple[Float[AnyArray, ""], ...]
+
+    def signals(self, points: tuple[Float[AnyArray, " points"], ...]) -> Float[Array, "frames controls"]:
+        """The value of every control in every frame [rad]."""
+        if not self.controls:
+            return jnp.zeros((self.motion.root.shape[0], 0))
+        return jnp.stack([c.signal(p) for c, p in zip(self.controls, points, strict=True)], axis=1)
+
+    def kinematics(self, signals: Float[AnyArray, "frames controls"] | None = None) -> Kinematics:
+        motion = self.motion
+        if signals is not None and self.controls:
+            rotations = turned(motion, self.controls, signals)
+            motion = Motion(motion.skeleton, motion.root, rotations, motion.dt, motion.translations)
+        else:
+            signals = jnp.zeros((motion.root.shape[0], len(self.controls)))
+        return forward_kinematics(self.skeleton, motion, signals)
+
+    def costs(self, points: tuple[Float[AnyArray, " points"], ...]) -> tuple[Float[Array, ""], ...]:
+        """1/2 w sum r^2 or w E of each term: the cost convention of _types.py."""
+        kin = self.kinematics(self.signals(points))
+        return tuple(w * term_cost(t, kin) for t, w in zip(self.terms, self.weights, strict=True))
+
+
 @eqx.filter_jit
-def _costs(problem: Problem, points) -> dict[str, Array]:
-    signals = None
-    if points is not None and problem.controls:
-        signals = jnp.stack([c.signal(p) for c, p in zip(problem.controls, points, strict=True)], axis=1)
-    kin = problem.kinematics(signals)
-    return {k: problem.weights[k] * term_cost(t, kin) for k, t in problem.terms.items()}
+def _costs(objective: Objective, points) -> tuple[Array, ...]:
+    return objective.costs(points)
 
 
 def term_cost(term: Term | Energy, kin: Kinematics) -> Float[Array, ""]:

@@ -200,6 +200,11 @@ class Skeleton(eqx.Module):
                 raise InputError(f"skeleton {name} has shape {array.shape}, expected {shape}")
 
     @cached_property
+    def memo(self) -> dict:
+        """What was computed once from this very skeleton on the host."""
+        return {}
+
+    @cached_property
     def role_of_joint(self) -> dict[int, str]:
         """Joint index -> role, for the joints that have one."""
         return {joint: role for role, joint in self.roles}

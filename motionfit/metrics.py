@@ -11,10 +11,11 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from motionfit._character import PARTS, Character
+from motionfit._character import Character
 from motionfit._motion import Motion, forward_kinematics, host_kinematics, joint_angles
 from motionfit._skinning import skin_points
 from motionfit._types import AnyArray
+from motionfit.shape.field import inside_depths, part_surface
 from motionfit.shape.pairs import PAIRS, Pair
 
 TOLERANCE = 0.01  # [m]: the "1 cm" of every frames_over_1cm
@@ -43,45 +44,6 @@ def posed_vertices(character: Character, motion: Motion) -> Float[np.ndarray, "f
     return np.asarray(_posed_vertices(character.skeleton, motion, skin.vertices_bind, skin.joints, skin.weights))
 
 
-class _PartSurface(NamedTuple):
-    vertices: np.ndarray  # indices of the part's vertices in the whole mesh
-    triangles: np.ndarray  # the part's triangles, in whole-mesh indices
-    used: np.ndarray  # the vertices that the triangles use
-    local: np.ndarray  # the triangles, in indices into `used`
-
-
-def _surfaces(character: Character, parts: Sequence[str]) -> dict[str, _PartSurface]:
-    faces, part_of_vertex = np.asarray(character.skin.faces), character.part_of_vertex
-    # a triangle across a border belongs to the part of two of its corners
-    of_face = np.median(np.sort(part_of_vertex[faces], axis=1), axis=1).astype(int)
-    surfaces = {}
-    for part in parts:
-        index = PARTS.index(part)
-        triangles = faces[of_face == index]
-        used, local = np.unique(triangles, return_inverse=True)
-        surfaces[part] = _PartSurface(
-            np.flatnonzero(part_of_vertex == index), triangles, used, local.reshape(-1, 3).astype(np.int64)
-        )
-    return surfaces
-
-
-def _inside_depths(points: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) -> Float[np.ndarray, " points"]:
-    """Depth [m] of points inside a surface (generalised winding number > 1/2), 0 for those outside."""
-    import igl
-
-    depth = np.zeros(len(points))
-    if len(triangles) == 0:
-        return depth
-    near = np.flatnonzero(((points >= vertices.min(0)) & (points <= vertices.max(0))).all(-1))
-    if len(near) == 0:
-        return depth
-    near = near[np.asarray(igl.fast_winding_number(vertices, triangles, points[near])) > 0.5]
-    if len(near):
-        squared = np.asarray(igl.point_mesh_squared_distance(points[near], vertices, triangles)[0])
-        depth[near] = np.sqrt(np.maximum(squared, 0.0))
-    return depth
-
-
 def skin_depths(
     character: Character,
     motion: Motion,
@@ -97,7 +59,7 @@ def skin_depths(
     itself. `step` looks at every step-th frame only.
     """
     parts = sorted({p for pair in pairs for p in (pair.first, pair.second)})
-    surfaces = _surfaces(character, parts)
+    surfaces = {part: part_surface(character, part) for part in parts}
     bind = np.asarray(character.skin.vertices_bind, float)
     # (probing part, surface part) in both directions of every pair
     directions = [(k, a, b) for k, pair in enumerate(pairs) for a, b in (pair[:2], pair[1::-1])]
@@ -113,7 +75,7 @@ def skin_depths(
             if counted is not None:
                 groups = [g[counted[k, a]] for g, (k, a) in zip(groups, probes, strict=True)]
             points = vertices[np.concatenate(groups)] if groups else np.zeros((0, 3))
-            depth = _inside_depths(points, vertices[mesh.used], mesh.local)
+            depth = inside_depths(points, vertices[mesh.used], mesh.triangles)
             for probe, part in zip(probes, np.split(depth, np.cumsum([len(g) for g in groups])[:-1]), strict=True):
                 found[probe] = part
         return found

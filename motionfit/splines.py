@@ -28,21 +28,22 @@ class Basis(eqx.Module):
         points = jnp.asarray(points)
         return sum(points[jnp.asarray(self.first) + k] * self.values[:, k] for k in range(DEGREE + 1))  # type: ignore
 
+    def __getitem__(self, frames: Int[np.ndarray, " some"]) -> "Basis":
+        """The same basis seen at some frames only."""
+        return Basis(self.first[frames], self.values[frames], self.count)
+
 
 def bspline_basis(frame_count: int, dt: float, spacing: float) -> Basis:
     """A cubic B-spline basis with a knot about every `spacing` [s] on `frame_count` frames of `dt` [s].
 
-    The knots are uniform and go on past both ends, so the first and the last frame have four control points like
-    every other. Clips shorter than one spacing get a single span.
+    Knots lie on every n-th frame, from the first frame on, and go on past both ends, so the first and the last frame
+    have four control points like every other; whatever the clip's length, frame t has the same ones.
     """
     if spacing <= 0:
         raise InputError(f"knot spacing must be above 0 s, got {spacing}")
-    duration = max((frame_count - 1) * float(dt), 1e-9)
-    spans = max(1, round(duration / spacing))
-    step = duration / spans
-    knots = step * np.arange(-DEGREE, spans + DEGREE + 1)
-    # the last frame lies on the last knot; SciPy takes it into the last span only if it is not past it
-    times = np.clip(np.arange(frame_count) * float(dt), 0.0, knots[spans + DEGREE])
-    rows = BSpline.design_matrix(times, knots, DEGREE)
+    every = max(1, round(spacing / float(dt)))
+    spans = max(1, -(-(frame_count - 1) // every))
+    knots = np.arange(-DEGREE, spans + DEGREE + 1) * float(every)
+    rows = BSpline.design_matrix(np.arange(frame_count, dtype=float), knots, DEGREE)
     first = rows.indices.reshape(frame_count, DEGREE + 1)
     return Basis(first[:, 0].astype(np.int32), rows.data.reshape(frame_count, DEGREE + 1), spans + DEGREE)

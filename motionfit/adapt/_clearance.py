@@ -1,58 +1,61 @@
 """Which overlaps have to go: clearance terms for a character, with what the reference body shows allowed."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
-from motionfit._character import Character
-from motionfit._motion import Kinematics, Motion, bind_pose, forward_kinematics, rest_motion
-from motionfit._skeleton import SIDES, Skeleton
+from motionfit._character import PARTS, Character
+from motionfit._motion import Kinematics, Motion, bucket, forward_kinematics, padded
+from motionfit._skeleton import SIDES
 from motionfit._types import InputError
+from motionfit.shape.field import Probes, fit_field, inside_depths, part_surface, sample_probes
 from motionfit.shape.pairs import Pair
-from motionfit.shape.volumes import fit_section, fit_volumes, sample_probes
-from motionfit.terms.penetration import CapsuleClearance, JointClearance, SkinClearance, bind_depths
+from motionfit.shape.volumes import fit_volumes
+from motionfit.terms.penetration import CapsuleClearance, JointClearance, SkinClearance
 
 OBJECTIVES = ("vertex", "capsule", "joint")
-PROBE_COUNT = {"upper_arm": 48, "forearm": 48, "hand": 32, "thigh": 60, "calf": 32}
+PROBE_COUNT = 96  # per pair: one every 3 cm on an upper arm
 Term = SkinClearance | CapsuleClearance | JointClearance
 
 
 class Clearance(NamedTuple):
-    """A clearance term that still allows nothing, and which of `pairs` each of its rows speaks of."""
+    """A clearance term that still allows nothing, and which of `pairs` each of its rows (or sets of probes) speaks of."""
 
     term: Term
     pairs: tuple[Pair, ...]
     pair_of_row: tuple[int, ...]
+    part_of_set: tuple[str, ...] = ()  # whose skin the probes of a row are
 
-    def row_depths(self, kin: Kinematics) -> Float[Array, "frames rows"]:
+    def allowing(self, allowed: Float[np.ndarray, "frames pairs"]) -> Term:
+        """The term with a depth [m] per frame and pair that does not count."""
+        rows = allowed[:, list(self.pair_of_row)]
         if isinstance(self.term, JointClearance):
-            return jnp.asarray(self.term.min_distance) - self.term.distance(kin)
-        return self.term.depth(kin)
-
-    def allowing(self, allowed: Float[np.ndarray, "frames rows"]) -> Term:
-        """The term with a depth [m] per frame and row that does not count."""
-        if isinstance(self.term, JointClearance):
-            limit = np.asarray(self.term.min_distance) - allowed
-            return eqx.tree_at(lambda t: t.min_distance, self.term, jnp.asarray(limit))
-        return eqx.tree_at(lambda t: t.allowed, self.term, jnp.asarray(allowed))
+            return eqx.tree_at(lambda t: t.min_distance, self.term, np.asarray(self.term.min_distance) - rows)
+        if isinstance(self.term, SkinClearance):
+            return eqx.tree_at(lambda t: t.allowed, self.term, tuple(rows[:, k, None] for k in range(rows.shape[1])))
+        return eqx.tree_at(lambda t: t.allowed, self.term, rows)
 
 
 def build_clearance(character: Character, pairs: tuple[Pair, ...], objective: str = "vertex") -> Clearance:
     """The clearance of some pairs of parts, by one of the three objectives.
 
-    `vertex`: skin points of the first part against the generalised cylinder of the second, and for limbs of one
-    kind the other way round too; `capsule`: the segments' capsules; `joint`: elbow to spine, thesis (4.6), and
-    calf to calf on the frontal plane, (4.11).
+    `vertex`: skin points of the first part against the depth field of the second, and for limbs of one kind the
+    other way round too; `capsule`: the segments' capsules; `joint`: elbow to spine, thesis (4.6), and calf to calf
+    on the frontal plane, (4.11). It is kept with the character, since it does not depend on the clip.
     """
     if objective not in OBJECTIVES:
         raise InputError(f"unknown objective {objective!r}; objectives: {', '.join(OBJECTIVES)}")
-    builder = {"vertex": _vertex, "capsule": _capsule, "joint": _joint}[objective]
-    return builder(character, pairs)
+    key = ("clearance", pairs, objective)
+    if key not in character.memo:
+        builder = {"vertex": _vertex, "capsule": _capsule, "joint": _joint}[objective]
+        character.memo[key] = builder(character, pairs)
+    return character.memo[key]
 
 
 def _vertex(character: Character, pairs: tuple[Pair, ...]) -> Clearance:
@@ -60,15 +63,28 @@ def _vertex(character: Character, pairs: tuple[Pair, ...]) -> Clearance:
     directed = [(k, p.first, p.second) for k, p in enumerate(pairs)]
     directed += [(k, p.second, p.first) for k, p in enumerate(pairs) if _kind(p.first) == _kind(p.second)]
     directed.sort()
-    probing = list(dict.fromkeys(a for _, a, _ in directed))
     hit = list(dict.fromkeys(b for _, _, b in directed))
-    probes = tuple(sample_probes(character, part, PROBE_COUNT[_kind(part)]) for part in probing)
-    sections = tuple(fit_section(character, part) for part in hit)
-    indices = tuple((probing.index(a), hit.index(b)) for _, a, b in directed)
-    counted = tuple((bind_depths(sections[s], probes[p].points_bind) <= 0.0).astype(float) for p, s in indices)
-    frames_free = np.zeros((1, len(indices)))
-    term = SkinClearance(probes, sections, indices, counted, frames_free)
-    return Clearance(term, pairs, tuple(k for k, _, _ in directed))
+    fields = tuple(_of(character, fit_field, part) for part in hit)
+    probes = tuple(_of(character, _counted_probes, a, b) for _, a, b in directed)
+    term = SkinClearance(probes, fields, tuple(hit.index(b) for _, _, b in directed),
+                         (np.zeros((1, 1)),) * len(directed))  # fmt: skip
+    return Clearance(term, pairs, tuple(k for k, _, _ in directed), tuple(a for _, a, _ in directed))
+
+
+def _of(character: Character, make, *parts: str):
+    """`make(character, *parts)`, once per character."""
+    key = (make.__name__, *parts)
+    if key not in character.memo:
+        character.memo[key] = make(character, *parts)
+    return character.memo[key]
+
+
+def _counted_probes(character: Character, part: str, against: str):
+    """Skin points of a part that lie outside the other part at bind: those inside are the joint itself."""
+    mine = np.flatnonzero(character.part_of_vertex == PARTS.index(part))
+    surface, vertices = part_surface(character, against), np.asarray(character.skin.vertices_bind, float)
+    outside = inside_depths(vertices[mine], vertices[surface.used], surface.triangles) == 0.0
+    return sample_probes(character, part, PROBE_COUNT, mine[outside] if outside.any() else mine)
 
 
 def _kind(part: str) -> str:
@@ -110,55 +126,90 @@ def _joint(character: Character, pairs: tuple[Pair, ...]) -> Clearance:
             joint = {"thigh": "calf", "calf": "foot"}[kind]
             rows.append((k, skeleton.joint(f"left_{joint}"), skeleton.joint(f"right_{joint}"),
                          radius[pair.first] + radius[pair.second]))  # fmt: skip
+    kept = sorted({k for k, *_ in rows})
     owner, first, second, limit = (tuple(column) for column in zip(*rows, strict=True))
     frontal = (skeleton.joint("left_thigh"), skeleton.joint("right_thigh")) if legs else None
-    return Clearance(JointClearance(first, second, np.array([limit]), frontal=frontal), pairs, owner)
+    term = JointClearance(first, second, np.array([limit]), frontal=frontal)
+    return Clearance(term, tuple(pairs[k] for k in kept), tuple(kept.index(k) for k in owner))
+
+
+# --- looking at a motion ----------------------------------------------------------------------------------------
+
+CHUNK = 1024  # frames looked at at once: what bounds the memory of long clips
 
 
 @eqx.filter_jit
-def _row_depths(clearance: Clearance, motion: Motion) -> Float[Array, "frames rows"]:
-    return clearance.row_depths(forward_kinematics(motion.skeleton, motion))
+def _over_time(look, term: Term, motion: Motion, allowed: Float[Array, "frames rows"] | None):
+    """`look(term, kinematics, allowed)` chunk after chunk of frames."""
+    frames = motion.root.shape[0]
+    pieces = -(-frames // CHUNK)
+    size = -(-frames // pieces)
+    order = jnp.minimum(jnp.arange(pieces * size), frames - 1).reshape(pieces, size)
+
+    def at(some):
+        part = jax.tree.map(lambda x: jnp.asarray(x)[some], (motion.root, motion.rotations, motion.translations, allowed))
+        chunk = Motion(motion.skeleton, part[0], part[1], motion.dt, part[2])
+        return look(term, forward_kinematics(motion.skeleton, chunk), part[3])
+
+    return jax.lax.map(at, order)
+
+
+def _row_depths(term: Term, kin: Kinematics, allowed) -> Float[Array, "frames rows"]:
+    del allowed
+    if isinstance(term, JointClearance):
+        return jnp.asarray(term.min_distance) - term.distance(kin)
+    return term.depth(kin)
+
+
+def _support(term: SkinClearance, kin: Kinematics, allowed) -> Float[Array, "sets points"]:
+    """How often a point is within 5 mm of its set's deepest, where the set is near to showing too much."""
+    counts = []
+    for k, depth in enumerate(term.point_depths(kin)):
+        deepest = jnp.max(depth, axis=1, keepdims=True)
+        matters = jax.nn.sigmoid((deepest - allowed[:, k, None]) / 0.01)
+        counts.append(jnp.sum(matters * jnp.clip(1.0 + (depth - deepest) / 0.005, 0.0, 1.0) + 1e-3 * depth, axis=0))
+    return jnp.stack(counts)
 
 
 def volume_depths(clearance: Clearance, motion: Motion) -> Float[np.ndarray, "frames pairs"]:
     """Depth [m] of every pair in every frame on the volumes, 0 where they are apart."""
-    rows = np.maximum(np.asarray(_row_depths(clearance, motion), float), 0.0)
-    depth = np.zeros((len(rows), len(clearance.pairs)))
-    for row, pair in enumerate(clearance.pair_of_row):
-        depth[:, pair] = np.maximum(depth[:, pair], rows[:, row])
-    return depth
+    frames = motion.frame_count
+    rows = np.asarray(_over_time(_row_depths, clearance.term, padded(motion, bucket(frames)), None), float)
+    rows = rows.reshape(-1, rows.shape[-1])[:frames]
+    owner = np.array(clearance.pair_of_row)
+    depth = np.stack([rows[:, owner == k].max(axis=1) for k in range(len(clearance.pairs))], axis=1)
+    return np.maximum(depth, 0.0)
 
 
-def rest_depths(clearance: Clearance, character: Character) -> Float[np.ndarray, "1 pairs"]:
-    """Depth [m] of every pair in the rest pose: what is allowed where there is no reference body."""
-    return volume_depths(clearance, rest_motion(character.skeleton))
+def support(
+    clearance: Clearance, motion: Motion, allowed: Float[np.ndarray, "frames pairs"]
+) -> Float[np.ndarray, "sets points"]:
+    """How much each probe has to do with the depth of its pair over the clip: what `reduced` goes by."""
+    frames = bucket(motion.frame_count)
+    rows = allowed[:, list(clearance.pair_of_row)]
+    rows = jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], frames - len(rows), axis=0)]), float)
+    return np.asarray(_over_time(_support, clearance.term, padded(motion, frames), rows)).sum(axis=0)
 
 
-def standing(skeleton: Skeleton) -> Motion:
-    """One frame of standing with the arms hanging 2 degrees from the vertical and straight, all else at bind."""
-    rest = rest_motion(skeleton)
-    positions, world = bind_pose(skeleton)
-    rotations = np.array(rest.rotations, float)
-    turned: dict[int, Rotation] = {}
-    for side in SIDES:
-        arm, elbow, hand = (skeleton.joint(f"{side}_{r}") for r in ("upper_arm", "forearm", "hand"))
-        sign = np.sign(positions[arm][0] - positions[skeleton.joint("chest")][0])
-        down = np.array([sign * np.sin(np.deg2rad(2)), -np.cos(np.deg2rad(2)), 0.0])
-        for joint, end in ((arm, elbow), (elbow, hand)):
-            bone = positions[end] - positions[joint]
-            laid, _ = Rotation.align_vectors(down[None], (bone / np.linalg.norm(bone))[None])
-            turned[joint] = laid * Rotation.from_quat(world[joint], scalar_first=True)
-    for joint in sorted(turned):
-        above, path = Rotation.identity(), []
-        parent = skeleton.parents[joint]
-        while parent >= 0 and parent not in turned:
-            path.append(parent)
-            parent = skeleton.parents[parent]
-        above = turned[parent] if parent >= 0 else above
-        for between in reversed(path):
-            above = above * Rotation.from_quat(rotations[0, between], scalar_first=True)
-        rotations[0, joint] = (above.inv() * turned[joint]).as_quat(scalar_first=True)
-    return Motion(skeleton, rest.root, rotations, rest.dt)
+def reduced(
+    clearance: Clearance, score: Float[np.ndarray, "sets points"], allowed: Float[np.ndarray, "frames pairs"],
+    counts: Mapping[str, int],
+) -> SkinClearance:  # fmt: skip
+    """What the solver works with: of every set the probes of greatest score, one set per field.
+
+    `counts` says how many by kind of part.
+    """
+    term, joined, rows = clearance.term, [], []
+    for k in range(len(term.fields)):
+        sets = [i for i, owner in enumerate(term.field_of) if owner == k]
+        kept = []
+        for i in sets:
+            count = counts[_kind(clearance.part_of_set[i])]
+            kept.append(np.sort(np.argsort(-score[i])[:count]))
+        joined.append(Probes.joined([term.probes[i][some] for i, some in zip(sets, kept, strict=True)]))
+        columns = np.repeat([clearance.pair_of_row[i] for i in sets], [len(some) for some in kept])
+        rows.append(allowed[:, columns])
+    return SkinClearance(tuple(joined), term.fields, tuple(range(len(joined))), tuple(rows), term.sigma, term.width)
 
 
 def allowance(
@@ -172,6 +223,3 @@ def allowance(
     """
     share = np.clip((excess - tolerance) / max(tolerance, 1e-9), 0.0, 1.0)
     return tolerance - margin * share
-
-
-__all__ = ["OBJECTIVES", "Clearance", "allowance", "build_clearance", "rest_depths", "volume_depths"]

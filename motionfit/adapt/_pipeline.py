@@ -1,51 +1,56 @@
 """`adapt`: a clip and a character in, an adapted clip out. Thesis 4.4 and 4.5, block after block."""
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from motionfit._character import Character
-from motionfit._control import Control
-from motionfit._fit import Block, Fit, fit
-from motionfit._motion import Motion
+from motionfit._control import Control, Correction
+from motionfit._fit import Block, BlockReport, Fit, fit
+from motionfit._motion import Motion, bucket, host_kinematics
 from motionfit._onto import onto
-from motionfit._problem import Problem, Term
+from motionfit._problem import During, Problem, Term
 from motionfit._types import InputError
-from motionfit.adapt._clearance import Clearance, allowance, build_clearance, rest_depths, standing, volume_depths
+from motionfit.adapt._clearance import Clearance, allowance, build_clearance, reduced, support, volume_depths
 from motionfit.adapt._controls import arm_controls, leg_controls
-from motionfit.metrics import TOLERANCE, skin_depths
+from motionfit.metrics import TOLERANCE
+from motionfit.shape.field import standing
 from motionfit.shape.growth import grow
-from motionfit.shape.pairs import Pair, pairs_of
-from motionfit.splines import bspline_basis
+from motionfit.shape.pairs import PAIRS, Pair, pairs_of
+from motionfit.splines import Basis, bspline_basis
 from motionfit.terms.pose import Effort, Smoothness
 
 BLOCKS = ("arms", "legs")
 
+SOLVE_RATE = 60.0  # [1/s] frames that the solver looks at; between two of them a limb's depth changes by millimetres
 KNOT_SPACING = 0.1  # [s]
-ALLOWED_EXCESS = 0.003  # [m]
-MARGIN = 0.004  # [m]
+SOLVE_PROBES = {"upper_arm": 20, "forearm": 16, "hand": 12, "thigh": 24, "calf": 12}  # per pair, of those looked at
+ALLOWED_EXCESS = 0.007  # [m]
+MARGIN = 0.001  # [m]
 SIGMA_DEPTH = 0.01  # [m]
-SIGMA_EFFORT = {"left_arm": 1.0, "right_arm": 1.0, "hip_turn": 0.1, "thighs_apart": 1.0}  # [rad]
-SIGMA_BEND = 5.0  # [rad/s^2]
-SKIN_ROUNDS = 3
-SKIN_INTERVAL = 1 / 15  # [s] between two looks at the skin
-SKIN_TOLERANCE = 0.007  # [m] excess that stays as it is
-SKIN_AIM = 0.004  # [m]
-SKIN_GAIN = 1.3
+SIGMA_EFFORT = {
+    "left_arm": 1.0, "left_arm_across": 1.0, "left_arm_twist": 1.0,
+    "right_arm": 1.0, "right_arm_across": 1.0, "right_arm_twist": 1.0,
+    "hip_turn": 0.1, "thighs_apart": 1.0,
+}  # [rad]  # fmt: skip
+JERK_SHARE = 1.0  # of the hands' own jerk, what the correction may add at the cost of 1 per frame
+LEVER = 0.5  # [m] shoulder to hand
+LEAST_JERK = 30.0  # [m/s^3] for clips that stand still
+LOOKS = 2
 
 
-def reference_depths(
-    clip: Motion, character: Character, reference: Character | None, pairs: tuple[Pair, ...], objective: str,
-    clearance: Clearance,
-) -> np.ndarray:  # fmt: skip
-    """Depth [m] per frame and pair that does not count: the clip's on the reference body, else that at rest."""
-    if reference is None:
-        return np.tile(rest_depths(clearance, character), (clip.frame_count, 1))
-    own = build_clearance(reference, pairs, objective)
-    return volume_depths(own, onto(clip, reference.skeleton))
+class Stage(NamedTuple):
+    """A block of the solve: its clearance on all probes and on the ones it works with, and the depths [m] that may
+    stay, per frame and pair."""
+
+    block: Block
+    recipe: str
+    clearance: Clearance
+    allowed: Float[np.ndarray, "frames pairs"]
 
 
 def adapt(
@@ -56,125 +61,151 @@ def adapt(
     girth: Mapping[str, float] | None = None,
     blocks: Sequence[str] = BLOCKS,
     objective: str = "vertex",
-    sweeps: int = 2,
+    sweeps: int = 1,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Fit:
-    """Adapt a clip to the shape of a character.
-
-    The clip is put on the character (`motionfit.onto`), then the blocks run in turn, `sweeps` times: `arms` keeps
-    upper arms, forearms and hands out of the trunk and the thighs, `legs` the thighs and calves apart.
-    Penetration counts as far as it exceeds what the same clip shows on `reference`, the body that it was made
-    for; without one, on the character before `girth`, else in its rest pose.
-
-    With a reference, the skin itself is looked at after the solve, some times per second, and where it shows more
-    than a few millimetres the volumes are given that much less room, up to three times.
-
-    The `Fit` holds the adapted motion, the correction, what each block did, and per pair and frame the excess
-    depth [m] on the volumes before and after (`fit.details["excess_before_m"]`, `["excess_after_m"]`).
-    """
     unknown = [b for b in blocks if b not in BLOCKS]
     if unknown or not blocks:
         raise InputError(f"unknown block {', '.join(map(repr, unknown)) or 'list'}; blocks: {', '.join(BLOCKS)}")
     if girth:
         reference, character = reference or character, grow(character, girth)
     base = onto(clip, character.skeleton)
-    pairs = pairs_of(*blocks)
-    basis = bspline_basis(base.frame_count, float(base.dt), KNOT_SPACING)
-    step = max(1, round(SKIN_INTERVAL / float(base.dt)))
-    quiet = own_joint = np.zeros(len(pairs), bool)
-    if reference is not None:
-        # A pair that shows no violation is left alone. What the reference shows standing with its arms hanging is
-        # the joint's own overlap, at the armpit above all: measured against the reference frame by frame it would
-        # count as excess wherever a clip holds the arms out, as every adapted clip does, and each further
-        # adaptation would push them further out.
-        own = skin_depths(reference, onto(clip, reference.skeleton), pairs, step=step)
-        at_ease = skin_depths(reference, standing(reference.skeleton), pairs).depth
-        at_ease = at_ease * np.array([p.adjacent for p in pairs])
-        untouched = skin_depths(character, base, pairs, step=step).depth
-        own_joint = at_ease[0] > 0
-        quiet = (untouched - np.maximum(own.depth, at_ease)).max(axis=0) <= TOLERANCE
+    frames = _solve_frames(base)
+    small = dataclasses.replace(base[frames], dt=np.asarray(base.dt) * (frames[1] - frames[0] if len(frames) > 1 else 1))
+    length = bucket(len(frames))
+    rows = frames[np.minimum(np.arange(length), len(frames) - 1)]  # of the clip, for each padded frame
+    basis = bspline_basis(length, float(small.dt), KNOT_SPACING)
+    everything = build_clearance(character, pairs_of(*blocks), objective)
+    pairs = everything.pairs
+    own, at_ease = _limits(clip, frames, character, reference, pairs, objective)
+    before = volume_depths(everything, small)
+    # A pair that shows no violation is left alone. What the reference shows standing with its arms hanging is the
+    # joint's own overlap, at the armpit above all: measured against the reference frame by frame it would count as
+    # excess wherever a clip holds the arms out, as every adapted clip does, and each further adaptation would push
+    # them further out.
+    excess = before - own
+    quiet = (before - np.maximum(own, at_ease)).max(axis=0) <= TOLERANCE
+    allowed = np.where(quiet, np.maximum(before, own), own + allowance(excess, ALLOWED_EXCESS, MARGIN))
+
+    whole = bspline_basis(base.frame_count, float(base.dt), _spacing(basis, small, base))
     controls: list[Control] = []
-    made: list[Block] = []
-    recipes: list[_Recipe] = []
-    for name in blocks:
-        clearance = build_clearance(character, pairs_of(name), objective)
-        limit = reference_depths(clip, character, reference, clearance.pairs, objective, clearance)
-        excess = volume_depths(clearance, base) - limit
-        allowed = limit + allowance(excess, ALLOWED_EXCESS, MARGIN)
-        if reference is not None:
-            mine = [pairs.index(p) for p in clearance.pairs]
-            alone = quiet[mine] & ((excess.max(axis=0) <= TOLERANCE) | own_joint[mine])
-            allowed = np.where(alone, np.maximum(allowed, excess + limit), allowed)
-            quiet[mine] = alone
-        recipe = _Recipe(name, clearance, limit, allowed)
-        new = (arm_controls(character, base, clearance, recipe.allowed_rows, basis) if name == "arms"
-               else leg_controls(character, base, basis))  # fmt: skip
-        controls += new
-        recipes.append(recipe)
-        made.append(Block(name, tuple(c.name for c in new), (f"{name}_clearance", "effort", "smoothness")))
-    effort = Effort(np.array([SIGMA_EFFORT[c.name] for c in controls]))
+    if "arms" in blocks:
+        controls += arm_controls(character, base, whole)
+    if "legs" in blocks:
+        controls += leg_controls(character, base, whole)
+    seen = tuple(_at(c, rows, basis) for c in controls)
+    stages = []
+    for recipe in blocks:
+        for block, mine in _blocks_of(recipe, pairs):
+            clearance = build_clearance(character, mine, objective)
+            columns = [pairs.index(p) for p in clearance.pairs]
+            stages.append(Stage(block, recipe, clearance, allowed[:, columns]))
 
-    def problem_of(recipes: list[_Recipe]) -> Problem:
-        terms: dict[str, Term] = {f"{r.name}_clearance": r.clearance.allowing(r.allowed_rows) for r in recipes}
-        return Problem(
-            character, base, terms | {"effort": effort, "smoothness": Smoothness(SIGMA_BEND)}, tuple(controls)
-        )
-
-    rounds = 1 + (SKIN_ROUNDS if reference is not None and objective == "vertex" else 0)
-    total, history, correction = rounds * sweeps * len(made), [], None
-    for round_ in range(rounds):
-        problem = problem_of(recipes)
-        result = fit(problem, made, sweeps, correction=correction, progress=None if progress is None else (
-            lambda name, done, _, round_=round_: progress(name, round_ * sweeps * len(made) + done, total)))  # fmt: skip
-        history, correction = [*history, *result.history], result.correction
-        if round_ == rounds - 1:
+    correction, history, result = Correction.zero(seen), [], None
+    smooth = _jerk_scale(base)
+    total = LOOKS * len(stages)
+    padded = dataclasses.replace(base[rows], dt=small.dt)
+    for look in range(LOOKS):
+        problem = _problem(character, padded, small, stages, seen, smooth, objective, result and result.motion[np.arange(len(frames))])
+        result = fit(problem, [s.block for s in stages], sweeps, correction=correction, progress=None if progress is None
+                     else lambda name, done, _, look=look: progress(name, look * len(stages) + done, total))  # fmt: skip
+        correction, history = result.correction, history + list(result.history)
+        after = volume_depths(everything, result.motion[np.arange(len(frames))])
+        over = np.where(quiet, 0.0, after - own)
+        if look == LOOKS - 1 or over.max(initial=0.0) <= TOLERANCE * 0.9:
             break
-        # the volumes are a model: what the skin itself still shows is taken off what they may keep
-        seen = skin_depths(character, result.motion, pairs, step=step)
-        excess = np.where(quiet, 0.0, seen.depth - own.depth)
-        if excess.max(initial=0.0) <= SKIN_TOLERANCE:
-            break
-        recipes = _tighten(recipes, pairs, seen.frames, excess, base.frame_count, float(base.dt))
-    before, after = (
-        np.concatenate([volume_depths(r.clearance, m) - r.limit for r in recipes], axis=1)
-        for m in (base, result.motion)
-    )
-    order = [pairs.index(p) for r in recipes for p in r.clearance.pairs]
-    left = after[:, ~quiet[order]].max(initial=0.0)
+        # the solver looks at some points only, and its corrections are smooth: what is still seen is taken off
+        stages = [_tighten(s, over[:, [pairs.index(p) for p in s.clearance.pairs]], float(small.dt)) for s in stages]
+    final = Correction(tuple(controls), tuple(np.asarray(p)[: whole.count] for p in correction.points))
+    motion = final.apply(base)
+    left = (after - own)[:, ~quiet].max(initial=0.0)
     status = "violations_left" if left > TOLERANCE else "converged"
-    details = {"pairs": [p.name for r in recipes for p in r.clearance.pairs],
-               "excess_before_m": before, "excess_after_m": after}  # fmt: skip
-    return Fit(correction, result.motion, base, status, tuple(history), problem, details)
+    details = {"pairs": [p.name for p in pairs], "frames": frames, "excess_before_m": before - own,
+               "excess_after_m": after - own}  # fmt: skip
+    return Fit(final, motion, base, status, tuple(history), result.problem, details)
 
 
-class _Recipe(NamedTuple):
-    """What a block works with: its clearance, the reference's depths, and the depths that may stay [m]."""
-
-    name: str
-    clearance: Clearance
-    limit: Float[np.ndarray, "frames pairs"]
-    allowed: Float[np.ndarray, "frames pairs"]
-
-    @property
-    def allowed_rows(self) -> Float[np.ndarray, "frames rows"]:
-        return self.allowed[:, list(self.clearance.pair_of_row)]
+def _solve_frames(base: Motion) -> Int[np.ndarray, " seen"]:
+    step = max(1, round(base.frame_rate / SOLVE_RATE))
+    return np.arange(0, base.frame_count, step)
 
 
-def _tighten(
-    recipes: list[_Recipe], pairs: tuple[Pair, ...], seen: np.ndarray, excess: np.ndarray, frame_count: int, dt: float
-) -> list[_Recipe]:
-    """Less may stay where the skin shows more than its tolerance: per pair, around the frames that show it."""
-    over = np.where(excess > SKIN_TOLERANCE, excess - SKIN_AIM, 0.0)
-    frames = np.arange(frame_count)
-    more = np.stack([np.interp(frames, seen, column) for column in over.T], axis=1)
-    # wide enough for a spline to follow, and nowhere less than what the frame itself needs
+def _spacing(basis: Basis, small: Motion, base: Motion) -> float:
+    every = max(1, round(KNOT_SPACING / float(small.dt)))
+    return every * float(small.dt)
+
+
+def _at(control: Control, frames: np.ndarray, basis: Basis) -> Control:
+    """The control as the solver sees it: at some frames of the clip."""
+    drives = tuple(
+        dataclasses.replace(d, axis_parent=d.axis_parent[frames] if np.ndim(d.axis_parent) == 2 else d.axis_parent)
+        for d in control.drives
+    )
+    return dataclasses.replace(control, drives=drives, basis=basis)
+
+
+def _blocks_of(recipe: str, pairs: tuple[Pair, ...]) -> list[tuple[Block, tuple[Pair, ...]]]:
+    if recipe == "legs":
+        names = ("hip_turn", "thighs_apart")
+        return [(Block("legs", names, ("legs_clearance", "effort", "smoothness")), tuple(p for p in pairs if p.block == "legs"))]
+    made = []
+    for side in ("left", "right"):
+        name = f"{side}_arm"
+        mine = tuple(p for p in pairs if p.block == "arms" and p.first.startswith(side))
+        made.append((Block(name, (name, f"{name}_across", f"{name}_twist"), (f"{name}_clearance", "effort", "smoothness")), mine))
+    return made
+
+
+def _limits(clip, frames, character, reference, pairs, objective):
+    """Depth [m] that does not count, per frame and pair, and that of the joint itself, per pair."""
+    body = reference or character
+    clearance = build_clearance(body, pairs, objective)
+    still = standing(body.skeleton)
+    adjacent = np.array([p.adjacent for p in pairs])
+    if reference is None:
+        from motionfit._motion import rest_motion
+        rest = volume_depths(clearance, rest_motion(body.skeleton))
+        return np.tile(rest, (len(frames), 1)), np.zeros(len(pairs))
+    moving = onto(clip[frames], body.skeleton)
+    both = Motion(body.skeleton, np.concatenate([moving.root, still.root]),
+                  np.concatenate([moving.rotations, still.rotations]), moving.dt)  # fmt: skip
+    depths = volume_depths(clearance, both)
+    return depths[:-1], depths[-1] * adjacent
+
+
+def _jerk_scale(base: Motion) -> float:
+    """[rad/s^3] that adds as much jerk at the hand as the clip has itself."""
+    positions = host_kinematics(base)[0][:, [base.skeleton.joint(f"{s}_hand") for s in ("left", "right")]]
+    positions = gaussian_filter1d(positions, 1 / (60 * float(base.dt)), axis=0, mode="nearest")  # not the noise
+    jerk = np.linalg.norm(np.diff(positions, 3, axis=0), axis=-1) / float(base.dt) ** 3 if len(positions) > 3 else np.zeros(1)
+    return JERK_SHARE * max(float(jerk.mean()), LEAST_JERK) / LEVER
+
+
+def _problem(character, padded, small, stages, controls, smooth, objective, after) -> Problem:
+    real = small.frame_count
+    mask = (np.arange(padded.frame_count) < real).astype(float)
+    inner = (np.arange(padded.frame_count) < real - 2).astype(float)
+    terms: dict[str, Term] = {}
+    for stage in stages:
+        far = np.full((padded.frame_count - real, stage.allowed.shape[1]), 1e3)
+        allowed = np.concatenate([stage.allowed, far])
+        clearance = stage.clearance
+        if objective == "vertex":
+            score = sum(support(clearance, m, stage.allowed) for m in ((small,) if after is None else (small, after)))
+            terms[stage.block.terms[0]] = reduced(clearance, score, allowed, SOLVE_PROBES)
+        else:
+            terms[stage.block.terms[0]] = clearance.allowing(allowed)
+    effort = Effort(np.array([SIGMA_EFFORT[c.name] for c in controls]))
+    terms |= {"effort": During(effort, mask), "smoothness": During(Smoothness(smooth), inner)}
+    return Problem(character, padded, terms, controls)
+
+
+def _tighten(stage: Stage, over: Float[np.ndarray, "frames pairs"], dt: float) -> Stage:
+    """Less may stay where more than the tolerance is still seen: per pair, around the frames that show it."""
+    more = np.where(over > TOLERANCE * 0.8, over - ALLOWED_EXCESS, 0.0)
     width = max(1, round(0.1 / dt))
     more = gaussian_filter1d(maximum_filter1d(more, 2 * width + 1, axis=0), width / 2, axis=0, mode="nearest")
-    tightened = []
-    for recipe in recipes:
-        columns = [pairs.index(p) for p in recipe.clearance.pairs]
-        tightened.append(recipe._replace(allowed=recipe.allowed - SKIN_GAIN * more[:, columns]))
-    return tightened
+    return stage._replace(allowed=stage.allowed - 1.3 * more)
 
 
 def arms(clip: Motion, character: Character, **options) -> Fit:

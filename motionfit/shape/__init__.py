@@ -3,9 +3,10 @@
 from motionfit.shape.distance import capsule_depth, cylinder_depth, segment_distance
 from motionfit.shape.growth import grow, parse_girth
 from motionfit.shape.pairs import PAIRS, Pair
-from motionfit.shape.volumes import Probes, Section, Volumes, allocate_vertices, fit_section, fit_volumes, sample_probes
+from motionfit.shape.field import DepthField, Probes, fit_field, sample_probes
+from motionfit.shape.volumes import Volumes, allocate_vertices, fit_volumes
 
 __all__ = [
-    "PAIRS", "Pair", "Probes", "Section", "Volumes", "allocate_vertices", "capsule_depth", "cylinder_depth",
-    "fit_section", "fit_volumes", "grow", "parse_girth", "sample_probes", "segment_distance",
+    "DepthField", "PAIRS", "Pair", "Probes", "Volumes", "allocate_vertices", "capsule_depth", "cylinder_depth",
+    "fit_field", "fit_volumes", "grow", "parse_girth", "sample_probes", "segment_distance",
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Terms that keep body parts out of each other: by joints, by capsules, and by skin points against volumes.
+"""Terms that keep body parts out of each other: by joints, by capsules, and by skin points against depth fields.
 
 All three count *excess* only: what goes beyond `allowed`, the overlap that the same pair shows on the reference
 body in the same frame (method: adjacent segments always overlap a little at the joint).
@@ -13,10 +13,10 @@ from jaxtyping import Float
 from motionfit import rotation
 from motionfit._motion import Kinematics
 from motionfit._problem import Term
-from motionfit._skinning import skin_points
 from motionfit._types import AnyArray
 from motionfit.shape.distance import capsule_depth, cylinder_depth
-from motionfit.shape.volumes import Probes, Section, Volumes
+from motionfit.shape.field import DepthField, Probes
+from motionfit.shape.volumes import Volumes
 
 
 def _array(x):
@@ -84,55 +84,36 @@ class CapsuleClearance(Term):
 
 
 class SkinClearance(Term):
-    """Points of parts' skin against the generalised cylinders of other parts: one row per frame and pair.
+    """Points of parts' skin against the depth fields of other parts: a residual per frame and point.
 
-    The row is the Euclidean norm over the points of their excess depth, so its square is the sum over points.
-    `pairs` name a set of `probes` and a section by their indices; `allowed` [m] is the depth that does not count,
-    per frame and pair. `counted` masks, per pair, the probes that lie inside the other part at bind already:
-    those are the joint itself. `sigma` [m].
+    Each of the `probes` is tested against the field that `field_of` names. `allowed` [m] is the depth that does not
+    count, per frame and set of probes, or per frame and point. `sigma` [m].
     """
 
     probes: tuple[Probes, ...]
-    sections: tuple[Section, ...]
-    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
-    counted: tuple[Float[AnyArray, "_"], ...]  # one length per pair
-    allowed: Float[AnyArray, "*frames pairs"]
+    fields: tuple[DepthField, ...]
+    field_of: tuple[int, ...] = eqx.field(static=True)
+    allowed: tuple[Float[AnyArray, "_ _"], ...]
     sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.01)
     width: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.002)
 
     def point_depths(self, kin: Kinematics) -> list[Float[Array, "frames points"]]:
-        """Depth [m] of every counted point per pair; points that do not count are far outside."""
-        # all probes at once, and each section once over all the probes that meet it: the program stays small
-        joined = [jnp.concatenate([jnp.asarray(getattr(p, k)) for p in self.probes])
-                  for k in ("points_bind", "joints", "weights")]  # fmt: skip
-        ends = np.cumsum([len(p.points_bind) for p in self.probes])
-        points = jnp.split(skin_points(kin, *joined), ends[:-1], axis=1)
-        depths: list[Array] = [jnp.zeros(())] * len(self.pairs)
-        for k, section in enumerate(self.sections):
-            meeting = [i for i, pair in enumerate(self.pairs) if pair[1] == k]
-            met = [points[self.pairs[i][0]] for i in meeting]
-            split = np.cumsum([m.shape[1] for m in met])[:-1]
-            for i, depth in zip(
-                meeting, jnp.split(section.depth(kin, jnp.concatenate(met, axis=1)), split, axis=1), strict=True
-            ):
-                depths[i] = jnp.where(jnp.asarray(self.counted[i]) > 0, depth, -1.0)
+        """Depth [m] of every point, set by set; negative outside."""
+        points = [p.positions_world(kin) for p in self.probes]
+        depths: list[Array] = [jnp.zeros(())] * len(points)
+        for k, field in enumerate(self.fields):
+            # each field once over all the probes that meet it: the program stays small
+            meeting = [i for i, owner in enumerate(self.field_of) if owner == k]
+            split = np.cumsum([points[i].shape[2] for i in meeting])[:-1]
+            met = field.depth(kin, jnp.concatenate([points[i] for i in meeting], axis=2))
+            for i, depth in zip(meeting, jnp.split(met, split, axis=1), strict=True):
+                depths[i] = depth
         return depths
 
-    def depth(self, kin: Kinematics) -> Float[Array, "frames pairs"]:
-        """Depth [m] of the deepest point of every pair in every frame; negative where all are outside."""
+    def depth(self, kin: Kinematics) -> Float[Array, "frames sets"]:
+        """Depth [m] of the deepest point of every set in every frame; negative where all are outside."""
         return jnp.stack([jnp.max(d, axis=-1) for d in self.point_depths(kin)], axis=-1)
 
-    def residual(self, kin: Kinematics) -> Float[Array, "frames pairs"]:
-        allowed = jnp.asarray(self.allowed)
-        rows = [
-            rotation.safe_norm(hinge(depth - allowed[:, k, None], self.width))
-            for k, depth in enumerate(self.point_depths(kin))
-        ]
-        return jnp.stack(rows, axis=-1) / self.sigma
-
-
-def bind_depths(section: Section, points_bind: Float[AnyArray, "points 3"]) -> Float[np.ndarray, " points"]:
-    """Depth [m] of bind-pose points in a section: which probes are part of the joint itself."""
-    padded = np.zeros((-(-len(points_bind) // 64) * 64, 3))  # whole chunks, so that it compiles once
-    padded[: len(points_bind)] = points_bind
-    return np.asarray(section.depth_bind(jnp.asarray(padded)))[: len(points_bind)]
+    def residual(self, kin: Kinematics) -> Float[Array, "frames points"]:
+        excess = [d - jnp.asarray(a) for d, a in zip(self.point_depths(kin), self.allowed, strict=True)]
+        return hinge(jnp.concatenate(excess, axis=-1), self.width) / self.sigma

@@ -30,20 +30,21 @@ class Effort(Term):
 
 
 class Smoothness(Term):
-    """Second time derivative of every control near zero: corrections that bend no more than they must.
+    """Third time derivative of every control near zero: corrections that add little jerk (Flash & Hogan 1985).
 
-    `sigma` [rad/s^2]. Central differences; the first and last frame have none.
+    `sigma` [rad/s^3]. The third difference of the frames t - 1 .. t + 2; rows whose stencil leaves the clip are zero.
     """
 
-    sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=30.0)
+    sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=1000.0)
 
     @property
-    def frame_local(self) -> bool:
-        return False
+    def reach(self) -> int:
+        return 2
 
     def residual(self, kin: Kinematics) -> Float[Array, "frames controls"]:
-        bend = (kin.signals[2:] - 2 * kin.signals[1:-1] + kin.signals[:-2]) / jnp.square(kin.dt)
-        return jnp.pad(bend, ((1, 1), (0, 0)))[: len(kin.signals)] / self.sigma
+        s = kin.signals
+        bend = (s[3:] - 3 * s[2:-1] + 3 * s[1:-2] - s[:-3]) / kin.dt**3
+        return jnp.pad(bend, ((1, 2), (0, 0)))[: len(s)] / self.sigma
 
 
 class JointTracking(Term):
