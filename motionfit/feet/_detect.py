@@ -21,8 +21,11 @@ from motionfit.feet._sole import Sole, sole_paths
 ADULT_LEG = 0.85  # [m] the leg for which the bounds below are given; speeds and heights go with the leg
 STILL = 0.6  # [m/s] a sole that moves faster is not down
 NEAR = 0.06  # [m] nor is one that is higher over the floor
+HELD = 2.5  # times as high where nothing else carries a body that does not fall
+FALLING = -0.4 * 9.81  # [m/s^2] a body whose root gathers speed downwards faster than this is in flight
 STEEP = 10.0  # [1/s] what a vertex that is higher than the lowest one of its foot pays: 1 cm counts as 0.1 m/s
 SMOOTHING = 0.025  # [s] three frames at 120 frames per second
+HELD_FOR = 0.05  # [s] over which the root's acceleration is averaged
 SWITCH = 0.015  # [s] of full evidence that a change of state costs
 SLIP = 0.005  # [m] of slide that another vertex or foot must save before the weight goes over to it
 SCALES = np.geomspace(0.5, 2.0, 15)  # root path in proportion to the source's, as far as it is looked for
@@ -31,13 +34,15 @@ SCALES = np.geomspace(0.5, 2.0, 15)  # root path in proportion to the source's, 
 class Evidence(NamedTuple):
     """What the labels are decided on: `paths_world` [m] of all sole vertices, per vertex `speed` [m/s] and, with
     what its height over the foot's lowest adds, `cost` [m/s]; per foot the `speed_low` of its stillest low vertex
-    [m/s] and its `height` over the floor [m]; and the proportion `path_scale` of the root path that they hold for."""
+    [m/s] and its `height` over the floor [m]; the root's upward `acceleration` [m/s^2]; and the proportion `path_scale`
+    of the root path that they hold for."""
 
     paths_world: Float[np.ndarray, "frames soles 3"]
     speed: Float[np.ndarray, "frames soles"]
     cost: Float[np.ndarray, "frames soles"]
     speed_low: Float[np.ndarray, "frames 2"]
     height: Float[np.ndarray, "frames 2"]
+    acceleration: Float[np.ndarray, " frames"]
     floor: Floor
     path_scale: float
 
@@ -91,6 +96,7 @@ def gather(
         above_lowest[:, mine] = heights - heights.min(1, keepdims=True)
     root = np.asarray(motion.root, float)
     root = velocity(smooth(root - root[:1], smoothing_frames(dt)), dt)
+    upward = velocity(smooth(root[:, 1], 2 * round(HELD_FOR / dt / 2) + 1), dt)
     root[:, 1] = 0.0
     penalty = STEEP * np.maximum(above_lowest - 0.005 * size, 0.0)
     scale = _path_scale(calm, root, penalty, rows, size)
@@ -105,7 +111,7 @@ def gather(
     if floor is None:
         weights = np.exp(-((speed_low / (0.5 * STILL * size)) ** 2)) if planted is None else planted.astype(float)
         floor = fit_floor(points.reshape(-1, 3), weights.reshape(-1))
-    return Evidence(paths, speed, cost, speed_low, floor.above(points), floor, scale)
+    return Evidence(paths, speed, cost, speed_low, floor.above(points), upward, floor, scale)
 
 
 def _path_scale(calm, root, penalty, rows, size: float) -> float:
@@ -161,9 +167,18 @@ def two_state_path(evidence: Float[np.ndarray, " frames"], cost: float) -> Bool[
 
 def _labels(evidence: Evidence, dt: float, size: float) -> tuple[np.ndarray, np.ndarray]:
     still = 1.0 - evidence.speed_low / (STILL * size)
+
+    def decide(near: Float[np.ndarray, "frames feet"]) -> tuple[np.ndarray, np.ndarray]:
+        both = np.clip(np.minimum(still, near), -1.0, 1.0)
+        return np.stack([two_state_path(both[:, f], 2 * SWITCH / dt) for f in (0, 1)], axis=1), both
+
     near = 1.0 - evidence.height / (NEAR * size)
-    both = np.clip(np.minimum(still, near), -1.0, 1.0)
-    planted = np.stack([two_state_path(both[:, f], 2 * SWITCH / dt) for f in (0, 1)], axis=1)
+    planted, both = decide(near)
+    # who neither stands nor falls is held by something: there a still foot may be higher over the plane, which one
+    # plane for a whole clip (and a body other than the actor's) does not always meet
+    held = ~planted.any(1) & (evidence.acceleration > FALLING * size)
+    if (held[:, None] & (still > 0)).any():
+        planted, both = decide(np.where(held[:, None], 1.0 - evidence.height / (HELD * NEAR * size), near))
     return planted, 1.0 / (1.0 + np.exp(-4.0 * both))
 
 
