@@ -22,7 +22,7 @@ from motionfit.feet import (
     sole_paths,
 )  # fmt: skip
 from motionfit.feet._cycles import adaptive_threshold, find_constraints
-from motionfit.feet._enforce import descending_step, effector_path
+from motionfit.feet._enforce import Chain, chain_effectors, chain_pose, descending_step, effector_path
 from motionfit.metrics import derivative_ratio
 from tests.helpers import random_motion, with_legs
 
@@ -265,6 +265,20 @@ def test_effector_path_is_eq_9_and_continuous(rng):
         speed[t1 - 1] < 0.35 * most and np.linalg.norm(np.diff(printed, axis=0), axis=1)[t1 - 1] > 0.9 * speed[t1 - 1]
     )
     assert [float(descending_step(np.array(x))) for x in (0.0, 0.5, 1.0)] == [1.0, 0.5, 0.0]
+
+
+def test_jacobians_of_the_leg_chain_against_differences(rng):
+    vectors = rng.normal(size=(5, 5, 3))
+    axes = np.linalg.qr(rng.normal(size=(5, 3, 3)))[0]
+    chain = Chain(*vectors[:4], axes[:, 0], axes[:, 1:])
+    for values in (0.4 * rng.normal(size=(5, 6)), np.zeros((5, 6)), 1e-5 * rng.normal(size=(5, 6))):
+        points, jacobians = chain_effectors(chain, values)
+        for k in range(6):
+            step = np.zeros(6)
+            step[k] = 1e-6
+            up, down = (chain_effectors(chain, values + s * step)[0] for s in (1, -1))
+            np.testing.assert_allclose(jacobians[..., k], (up - down) / 2e-6, atol=1e-8)
+        np.testing.assert_allclose(points[1], chain_pose(chain, values)[5])
 
 
 @pytest.mark.parametrize("body", ["average", "heavy"])

@@ -99,33 +99,37 @@ def _left_jacobian(vector: np.ndarray) -> np.ndarray:
     return np.eye(3) + a * cross + b * cross @ cross
 
 
+def chain_effectors(
+    chain: Chain, values: np.ndarray
+) -> tuple[Float[np.ndarray, "effectors batch 3"], Float[np.ndarray, "effectors batch 3 6"]]:
+    """Where ankle and toe are [m], and how the six values move them."""
+    upper, lower, _, knee, ankle, toe = chain_pose(chain, values)
+    points = np.stack([ankle, toe])
+    jacobians = np.zeros((2, len(values), 3, 6))
+    hips = np.swapaxes(_left_jacobian(values[:, :3]), 1, 2)  # rows: world axes of the three hip values
+    jacobians[..., :3] = np.swapaxes(np.cross(hips, (points - chain.hip)[:, :, None]), 2, 3)
+    jacobians[..., 3] = np.cross(upper.apply(chain.knee_axis), points - knee)
+    vector = np.einsum("fk,fka->fa", values[:, 4:6], chain.ankle_axes)
+    axes = np.einsum("fab,fkb->fka", _left_jacobian(vector), chain.ankle_axes)
+    for k in range(2):
+        jacobians[1, :, :, 4 + k] = np.cross(lower.apply(axes[:, k]), toe - ankle)
+    return points, jacobians
+
+
 def chain_tasks(chain: Chain, goals: list[Float[np.ndarray, "batch 3"]]) -> list[Task]:
     """Ankle first, then toe: errors [m] and Jacobians of the chain's values."""
+    last: list = [None, None]  # both tasks are asked for the same values in turn: their kinematics is done once
 
-    def columns(values: np.ndarray, which: str) -> tuple[np.ndarray, np.ndarray]:
-        upper, lower, _, knee, ankle, toe = chain_pose(chain, values)
-        point = ankle if which == "ankle" else toe
-        hips = _left_jacobian(values[:, :3])  # world axes of the three hip values
-        jacobian = np.zeros((len(values), 3, 6))
-        arm = point - chain.hip
-        jacobian[:, :, :3] = np.swapaxes(np.cross(np.swapaxes(hips, 1, 2), arm[:, None]), 1, 2)
-        jacobian[:, :, 3] = np.cross(upper.apply(chain.knee_axis), point - knee)
-        if which == "toe":
-            vector = np.einsum("fk,fka->fa", values[:, 4:6], chain.ankle_axes)
-            axes = np.einsum("fab,fkb->fka", _left_jacobian(vector), chain.ankle_axes)
-            for k in range(2):
-                jacobian[:, :, 4 + k] = np.cross(lower.apply(axes[:, k]), toe - ankle)
-        return point, jacobian
+    def task_of(part: int) -> Task:
+        def task(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            if last[0] is None or not np.array_equal(last[0], values):
+                last[:] = values.copy(), chain_effectors(chain, values)
+            points, jacobians = last[1]
+            return goals[part] - points[part], jacobians[part]
 
-    def ankle_task(values):
-        point, jacobian = columns(values, "ankle")
-        return goals[0] - point, jacobian
+        return task
 
-    def toe_task(values):
-        point, jacobian = columns(values, "toe")
-        return goals[1] - point, jacobian
-
-    return [ankle_task, toe_task][: len(goals)]
+    return [task_of(part) for part in range(len(goals))]
 
 
 def enforce(
