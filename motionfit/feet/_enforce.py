@@ -134,7 +134,7 @@ def chain_tasks(chain: Chain, goals: list[Float[np.ndarray, "batch 3"]]) -> list
 
 def enforce(
     base: Motion, sole: Sole, plants: Footplants, target: Floor | None = None, lift: float | None = None
-) -> tuple[Motion, Bool[np.ndarray, "frames 2"], dict[str, float]]:
+) -> tuple[Motion, Bool[np.ndarray, "frames 2"], Bool[np.ndarray, "frames 2"], dict[str, float]]:
     """Heel and toe of both feet held where adaptive thresholds find them constrained.
 
     Per leg a chain of six degrees of freedom from hip to toe and two positional effectors: the ankle first, then
@@ -142,6 +142,8 @@ def enforce(
     the effector's mean place over its constraint (the source takes the one at its beginning), put at the height over
     the floor that the joint has in the bind pose. Where only one of both is held the other's path is drawn to the foot's length from it, so
     that both can be met. The character comes down where a leg is too short.
+
+    Returns the motion, which feet are held by heel or toe, which heels could be brought to their goals, and details.
     """
     skeleton, dt = base.skeleton, float(base.dt)
     floor = plants.floor if target is None else target
@@ -166,11 +168,13 @@ def enforce(
     down = lowering(legs, [p[0] for p in paths], dt) if lift is None else np.full(base.frame_count, float(lift))
     positions = positions - np.array([0.0, 1.0, 0.0]) * down[:, None, None]
     local, reachable = np.array(base.rotations, float), np.ones((base.frame_count, 2), bool)
+    held = np.zeros_like(reachable)
     worst = [0.0, 0.0]
     for side, (mine, leg) in enumerate(zip(joints, find_legs(skeleton, positions, rotations), strict=True)):
         errors = _turn_leg(base, leg, mine, positions, rotations, paths[side], local)
         for part, error in enumerate(errors):
             for start, end, _ in goals[side][part]:
+                held[start : end + 1, side] = True
                 worst[part] = max(worst[part], float(error[start : end + 1].max()))
                 if part == 0:
                     reachable[start : end + 1, side] = error[start : end + 1] < REACHED
@@ -178,7 +182,7 @@ def enforce(
                "ankle_error_max_m": worst[0], "toe_error_max_m": worst[1]}  # fmt: skip
     moved = Motion(skeleton, positions[:, 0].astype(np.asarray(base.root).dtype),
                    local.astype(np.asarray(base.rotations).dtype), base.dt, base.translations)  # fmt: skip
-    return moved, reachable, details
+    return moved, held, reachable, details
 
 
 Goal = tuple[int, int, np.ndarray]

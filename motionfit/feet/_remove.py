@@ -215,7 +215,10 @@ def remove_footskate(
     elif method == "leg-ik":
         result, reachable, details = with_leg_ik(base, sole, plants, paths, rows, speed, target, lift)
     else:
-        result, reachable, details = enforce(base, sole, plants, target, lift)
+        result, held, reachable, details = enforce(base, sole, plants, target, lift)
+        # the plants are now those that were enforced; where a foot stands is read off the result
+        evidence = gather(sole, result, plants.floor if target is None else target)
+        plants = assemble(sole, evidence, held, held.astype(float), float(base.dt))
     if target is not None:
         plants = Footplants(plants.planted, plants.vertex, plants.confidence, plants.primary, target, plants.dt)
     return FootFit(result, base, plants, method, reachable, details, sole)
