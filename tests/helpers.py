@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from motionfit import Character, Motion, Skeleton, Skin
-from motionfit._motion import bind_pose
+from motionfit._motion import bind_pose, rest_motion
 
 
 def random_motion(seed: int, joints: int, frames: int, rate: float = 60.0) -> Motion:
@@ -67,3 +67,14 @@ def with_legs(character: Character, scale: float) -> Character:
     moved = vertices + np.einsum("vk,vka->va", weights, (bind_pose(longer)[0] - old)[joints])
     moved = moved + np.einsum("vk,vkab,vkb->va", weights, stretch[joints], vertices[:, None] - old[joints])
     return Character(longer, Skin(moved, skin.faces, skin.joints, skin.weights), f"{character.name} legs {scale:g}")
+
+
+def jumping(body: Character, height: float, rate: float = 60.0) -> tuple[Motion, np.ndarray]:
+    """The bind pose standing, in ballistic flight, and standing; with the frames in the air."""
+    rest = rest_motion(body.skeleton, 1 / rate)
+    flight = np.sqrt(8 * height / 9.81)
+    times = np.arange(round((1.0 + flight) * rate)) / rate - 0.5
+    up = np.where((times > 0) & (times < flight), 9.81 / 2 * times * (flight - times), 0.0)
+    root = np.asarray(rest.root) + up[:, None] * [0.0, 1.0, 0.0] + np.clip(times, 0, flight)[:, None] * [0.0, 0.0, 0.8]
+    rotations = np.repeat(np.asarray(rest.rotations), len(times), axis=0)
+    return Motion(body.skeleton, root, rotations, 1 / rate), up > 0

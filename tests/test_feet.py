@@ -36,6 +36,7 @@ from motionfit.feet._detect import smooth, two_state_path
 from motionfit.feet._plants import runs
 from motionfit.feet._transfer import evaluate, integral
 from motionfit.metrics import posed_vertices
+from tests.helpers import jumping
 
 SAME = 1e-9  # [m] "unchanged" in double precision
 ROOT = 1e-5  # closed-form roots against numpy.roots: multiple roots keep a third of the digits in both
@@ -411,17 +412,6 @@ def test_builtin_walk_is_labelled_as_it_was_made(average):
     assert set(plants.labels) == {"left", "right", "both"}
     assert abs(plants.floor.height) < 0.01 and plants.floor.tilt < 0.01
     assert ((plants.vertex >= 0) == plants.planted).all() and plants.confidence[plants.planted].mean() > 0.8
-
-
-def jumping(body: mf.Character, height: float, rate: float = 60.0) -> tuple[mf.Motion, np.ndarray]:
-    """The bind pose standing, in ballistic flight, and standing; with the frames in the air."""
-    rest = rest_motion(body.skeleton, 1 / rate)
-    flight = np.sqrt(8 * height / 9.81)
-    times = np.arange(round((1.0 + flight) * rate)) / rate - 0.5
-    up = np.where((times > 0) & (times < flight), 9.81 / 2 * times * (flight - times), 0.0)
-    root = np.asarray(rest.root) + up[:, None] * [0.0, 1.0, 0.0] + np.clip(times, 0, flight)[:, None] * [0.0, 0.0, 0.8]
-    rotations = np.repeat(np.asarray(rest.rotations), len(times), axis=0)
-    return mf.Motion(body.skeleton, root, rotations, 1 / rate), up > 0
 
 
 @pytest.mark.parametrize("rate", [24.0, 60.0, 120.0])

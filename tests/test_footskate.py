@@ -23,8 +23,9 @@ from motionfit.feet import (
 )  # fmt: skip
 from motionfit.feet._cycles import adaptive_threshold, find_constraints
 from motionfit.feet._enforce import Chain, chain_effectors, chain_pose, descending_step, effector_path
+from motionfit.feet._leg import calm_feet
 from motionfit.metrics import derivative_ratio
-from tests.helpers import random_motion, with_legs
+from tests.helpers import jumping, random_motion, with_legs
 
 SAME = 1e-9  # [m] "unchanged" in double precision
 
@@ -179,16 +180,35 @@ def test_leg_ik_holds_both_feet_exactly_without_snapping(heavy):
     base = found.base
     assert (derivative_ratio(found.motion, base, 2) or 9.0) < 1.2
     assert found.measure(found.motion)["ground_penetration_max_m"] < 0.02
-    # only legs turn, and the feet keep their direction
+    # only legs turn, and the feet keep their direction but for what trembles in a twentieth of a second
     turned = joint_angles(found.motion, base).max(0)
-    legs = [base.skeleton.joint(f"{s}_{r}") for s in ("left", "right") for r in ("thigh", "calf", "foot")]
+    legs = [base.skeleton.joint(f"{s}_{r}") for s in ("left", "right") for r in ("thigh", "calf", "foot", "toe")]
     assert np.delete(turned, legs).max() < 1e-12
     feet = [base.skeleton.joint(f"{s}_foot") for s in ("left", "right")]
     a, b = (
         Rotation.from_quat(host_kinematics(m)[1][:, feet].reshape(-1, 4), scalar_first=True)
         for m in (base, found.motion)
     )
-    assert (a.inv() * b).magnitude().max() < 1e-7
+    assert (a.inv() * b).magnitude().max() < np.radians(2)
+
+
+def test_trembling_feet_are_calmed_where_they_stand(average):
+    """A standing body whose feet tremble by a degree: the tremor goes, what is in the air stays bit for bit."""
+    rng = np.random.default_rng(4)
+    still = jumping(average, 0.3)[0]
+    rotations = np.array(still.rotations)
+    foot = average.skeleton.joint("left_foot")
+    shake = Rotation.from_rotvec(0.015 * rng.normal(size=(len(rotations), 3)))
+    rotations[:, foot] = (Rotation.from_quat(rotations[:, foot], scalar_first=True) * shake).as_quat(scalar_first=True)
+    shaking = mf.Motion(still.skeleton, still.root, rotations, still.dt)
+    found = mf.remove_footskate(shaking, average, "leg-ik")
+    down = np.flatnonzero(found.plants.planted[:, 0])[5:25]
+    left, before = (
+        joint_angles(m, still)[down, foot].mean() for m in (calm_feet(shaking, found.plants.vertex), shaking)
+    )
+    assert left < 0.5 * before
+    air = ~found.plants.planted[:, 0]
+    np.testing.assert_array_equal(calm_feet(shaking, found.plants.vertex).rotations[air], rotations[air])
 
 
 def test_legs_that_cannot_reach_say_so_and_come_as_near_as_they_can(average):

@@ -25,6 +25,7 @@ from motionfit.ik import move_limb
 CALM = 0.25  # [s] over which the root's correction is averaged, twice: the legs take the rest
 EASE = 0.12  # [s] within which a foot comes to rest and leaves again
 EVEN = 0.1  # [s] over which the height of a standing sole is averaged: its noise would go to the knee
+TREMOR = 0.06  # [s] over which the rotation of a standing foot is averaged
 EXACT = 1e-9  # [m] to which the vertices that stand are brought to their places
 STRETCH = 0.99  # of a leg's length: near the end the knee turns by degrees for a millimetre at the foot
 LOWEST = 0.1  # of a leg's length, as far as the character is lowered for the legs' sake
@@ -179,6 +180,39 @@ def turn_legs(
     return local, reachable
 
 
+def calm_feet(motion: Motion, rows: Int[np.ndarray, "frames 2"]) -> Motion:
+    """The motion with the tremor of its planted feet averaged away.
+
+    A foot that stands does not tremble; in a capture it does, by a degree or so. Held at the toes, it would hand
+    that on to the knee. Over `TREMOR` the foot's world rotation and the toes' local one are averaged, less and less
+    towards both ends of a plant, so that they join what is before and after.
+    """
+    skeleton, dt = motion.skeleton, float(motion.dt)
+    local, width = np.array(motion.rotations, float), 2 * round(TREMOR / dt / 2) + 1
+    world = host_kinematics(motion)[1]
+    for foot, side in enumerate(SIDES):
+        ankle, toe = skeleton.joint(f"{side}_foot"), skeleton.find(f"{side}_toe")
+        turned = world[:, ankle].copy()
+        for start, end in runs(rows[:, foot] >= 0):
+            part = slice(start, end + 1)
+            turned[part] = _mean_rotation(turned[part], width)
+            if toe is not None:
+                local[part, toe] = _mean_rotation(local[part, toe], width)
+        above = Rotation.from_quat(world[:, skeleton.parents[ankle]], scalar_first=True)
+        new = (above.inv() * Rotation.from_quat(turned, scalar_first=True)).as_quat(scalar_first=True)
+        new *= np.where((new * local[:, ankle]).sum(1, keepdims=True) < 0, -1.0, 1.0)
+        planted = rows[:, foot] >= 0
+        local[planted, ankle] = new[planted]
+    return Motion(skeleton, motion.root, local, motion.dt, motion.translations)
+
+
+def _mean_rotation(q: Float[np.ndarray, "frames 4"], width: int) -> Float[np.ndarray, "frames 4"]:
+    """Running mean of unit quaternions that lie close together."""
+    flips = np.cumprod(np.append(1.0, np.where((q[1:] * q[:-1]).sum(1) < 0, -1.0, 1.0)))[:, None]
+    mean = smooth(q * flips, width)
+    return mean / np.linalg.norm(mean, axis=1, keepdims=True) * flips
+
+
 def with_leg_ik(
     base: Motion,
     sole: Sole,
@@ -189,7 +223,12 @@ def with_leg_ik(
     target: Floor | None,
     lift: float | None,
 ) -> tuple[Motion, Bool[np.ndarray, "frames 2"], dict[str, float]]:
-    """The motion with planted feet exactly in place, which legs reached, and by how much it was lowered [m]."""
+    """The motion with planted feet exactly in place, which legs reached, and by how much it was lowered [m].
+
+    The vertices stood on hold their places to `EXACT`; the feet keep their orientation, less its tremor.
+    """
+    base = calm_feet(base, rows)
+    paths = sole_paths(sole, base)
     dt, root = float(base.dt), np.asarray(base.root, float)
     frames = np.arange(base.frame_count)
     carrier = np.where(plants.primary >= 0, rows[frames, np.maximum(plants.primary, 0)], -1)
