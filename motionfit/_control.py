@@ -60,15 +60,18 @@ def turned(
     and where all of them are zero the motion's own rotation comes back bit for bit.
     """
     rotations = jnp.asarray(motion.rotations)
-    if not any(control.drives for control in controls):
+    driven = [(k, drive) for k, control in enumerate(controls) for drive in control.drives]
+    if not driven:
         return rotations
-    vectors = jnp.zeros((*rotations.shape[:2], 3), rotations.dtype)
-    for k, control in enumerate(controls):
-        for drive in control.drives:
-            push = (signals[:, k] * drive.gain)[:, None] * jnp.asarray(drive.axis_parent).reshape(-1, 3)
-            vectors = vectors.at[:, jnp.asarray(drive.joint)].add(push.astype(rotations.dtype))
+    joints = jnp.stack([jnp.asarray(drive.joint) for _, drive in driven])
+    pushes = jnp.stack(
+        [(signals[:, k] * d.gain)[:, None] * jnp.asarray(d.axis_parent).reshape(-1, 3) for k, d in driven], axis=1
+    )
+    # drives of one joint add up; each of them then writes the same rotation
+    together = (joints[:, None] == joints[None, :]).astype(pushes.dtype)
+    vectors = jnp.einsum("de,tea->tda", together, pushes).astype(rotations.dtype)
     # exp(0) is the identity exactly, and multiplying by it changes no bit
-    return rotation.multiply(rotation.exp(vectors), rotations)
+    return rotations.at[:, joints].set(rotation.multiply(rotation.exp(vectors), rotations[:, joints]))
 
 
 class Correction(eqx.Module):

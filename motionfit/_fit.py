@@ -40,7 +40,7 @@ class Block(eqx.Module):
     name: str = eqx.field(static=True)
     controls: tuple[str, ...] = eqx.field(static=True)
     terms: tuple[str, ...] | None = eqx.field(static=True, default=None)
-    max_steps: int = eqx.field(static=True, default=40)
+    max_steps: int = eqx.field(static=True, default=24)
     solver: optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser | None = None
 
 
@@ -97,7 +97,7 @@ class Fit(eqx.Module):
 
 
 def levenberg_marquardt(
-    linear_solver: lx.AbstractLinearSolver | None = None, rtol: float = 1e-4, atol: float = 1e-5
+    linear_solver: lx.AbstractLinearSolver | None = None, rtol: float = 1e-3, atol: float = 1e-3
 ) -> optx.LevenbergMarquardt:
     """The default solver. Without a `Banded` solver its normal equations are dense and factorised by Cholesky: the
     damping keeps them definite, and a tall QR of the same system takes several times longer."""

@@ -4,7 +4,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jax import Array
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation, Slerp
 
 from motionfit import rotation
@@ -97,19 +98,28 @@ def resample(motion: Motion, frame_rate: float) -> Motion:
 class Kinematics(eqx.Module):
     """What forward kinematics returns. Computed once per evaluation; every term reads it.
 
-    `positions_world` [m] and `rotations_world` of all joints, the `rotations_parent` they came from, `dt` [s];
-    `skin_rotations` (matrices) and `skin_translations` [m], which take a bind-pose point to the world with each
-    joint, M_j B_j^-1 of thesis (4.20); and `signals`, the values of the problem's controls in each frame [rad]
-    (none without a correction). Under jit, what no term reads is not computed.
+    `positions_world` [m] and `rotations_world` of all joints, the `rotations_parent` they came from, the bind pose's
+    `positions_bind` [m] and `rotations_bind` in the world, `dt` [s], and `signals`, the values of the problem's
+    controls in each frame [rad] (none without a correction). Under jit, what no term reads is not computed.
     """
 
     positions_world: Positions
     rotations_world: Rotations
     rotations_parent: Rotations
-    skin_rotations: Float[AnyArray, "frames joints 3 3"]
-    skin_translations: Positions
+    positions_bind: Float[AnyArray, "joints 3"]
+    rotations_bind: Float[AnyArray, "joints 4"]
     dt: Float[AnyArray, ""]
     signals: Float[AnyArray, "frames controls"]
+
+    def skin_transforms(
+        self, joints: Int[AnyArray, " some"] | slice = slice(None)
+    ) -> tuple[Float[Array, "frames some 3 3"], Float[Array, "frames some 3"]]:
+        """Rotation matrices and translations [m] that take a bind-pose point to the world with each joint:
+        M_j B_j^-1 of thesis (4.20)."""
+        turn = rotation.multiply(self.rotations_world[:, joints], rotation.conjugate(self.rotations_bind[joints]))
+        matrices = rotation.to_matrix(turn)
+        moved = jnp.sum(matrices * self.positions_bind[joints][None, :, None, :], axis=-1)
+        return matrices, self.positions_world[:, joints] - moved
 
 
 def forward_kinematics(
@@ -164,13 +174,12 @@ def forward_kinematics(
         for first, x in zip(top, levels, strict=True)
     )
     turned, positions = jnp.transpose(turned, (2, 1, 0)), jnp.transpose(positions, (2, 1, 0))
-    skin_rotations = rotation.to_matrix(rotation.multiply(turned[:-1], rotation.conjugate(turned[-1:])))
     return Kinematics(
         positions_world=positions[:-1],
         rotations_world=turned[:-1],
         rotations_parent=rotations,
-        skin_rotations=skin_rotations,
-        skin_translations=positions[:-1] - jnp.einsum("tjab,jb->tja", skin_rotations, positions[-1]),
+        positions_bind=positions[-1],
+        rotations_bind=turned[-1],
         dt=jnp.asarray(motion.dt),
         signals=jnp.zeros((frames, 0), dtype) if signals is None else signals,
     )

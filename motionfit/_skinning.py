@@ -82,12 +82,13 @@ def skin_points(
     The sum runs over the few influences of each point only.
     """
     joints, weights, points = jnp.asarray(joints), jnp.asarray(weights), jnp.asarray(points_bind)
-    dtype = kin.skin_rotations.dtype
+    turns, shifts = kin.skin_transforms()
+    dtype = turns.dtype
     weights, points = weights.astype(dtype), points.astype(dtype)
     total = jnp.zeros((kin.positions_world.shape[0], *points.shape), dtype)
     for k in range(joints.shape[1]):
-        moved = jnp.einsum("tpab,pb->tpa", kin.skin_rotations[:, joints[:, k]], points)
-        total = total + weights[:, k][:, None] * (moved + kin.skin_translations[:, joints[:, k]])
+        moved = jnp.einsum("tpab,pb->tpa", turns[:, joints[:, k]], points)
+        total = total + weights[:, k][:, None] * (moved + shifts[:, joints[:, k]])
     return total
 
 
@@ -95,8 +96,8 @@ def skin(mesh: Skin, kin: Kinematics) -> tuple[Float[Array, "frames vertices 3"]
     """World vertices [m] and unit normals of the whole skin in every frame: (4.20)."""
     vertices = skin_points(kin, mesh.vertices_bind, mesh.joints, mesh.weights)
     joints, weights, normals_bind = jnp.asarray(mesh.joints), jnp.asarray(mesh.weights), mesh.normals_bind
-    normals = jnp.zeros_like(vertices)
+    normals, turns = jnp.zeros_like(vertices), kin.skin_transforms()[0]
     for k in range(joints.shape[1]):
-        turned = jnp.einsum("tpab,pb->tpa", kin.skin_rotations[:, joints[:, k]], normals_bind.astype(vertices.dtype))
+        turned = jnp.einsum("tpab,pb->tpa", turns[:, joints[:, k]], normals_bind.astype(vertices.dtype))
         normals = normals + weights[:, k][:, None].astype(vertices.dtype) * turned
     return vertices, rotation.normalize(normals)

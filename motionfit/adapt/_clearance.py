@@ -63,10 +63,12 @@ def _vertex(character: Character, pairs: tuple[Pair, ...]) -> Clearance:
     directed = [(k, p.first, p.second) for k, p in enumerate(pairs)]
     directed += [(k, p.second, p.first) for k, p in enumerate(pairs) if _kind(p.first) == _kind(p.second)]
     directed.sort()
-    hit = list(dict.fromkeys(b for _, _, b in directed))
-    fields = tuple(_of(character, fit_field, part) for part in hit)
+    # whose arm and thigh pull at a trunk depends on the side that comes near it
+    met = [(b, a.partition("_")[0] if b == "torso" else "left") for _, a, b in directed]
+    hit = list(dict.fromkeys(met))
+    fields = tuple(_of(character, fit_field, *key) for key in hit)
     probes = tuple(_of(character, _counted_probes, a, b) for _, a, b in directed)
-    term = SkinClearance(probes, fields, tuple(hit.index(b) for _, _, b in directed),
+    term = SkinClearance(probes, fields, tuple(hit.index(key) for key in met),
                          (np.zeros((1, 1)),) * len(directed))  # fmt: skip
     return Clearance(term, pairs, tuple(k for k, _, _ in directed), tuple(a for _, a, _ in directed))
 

@@ -28,7 +28,7 @@ BLOCKS = ("arms", "legs")
 
 SOLVE_RATE = 60.0  # [1/s] frames that the solver looks at; between two of them a limb's depth changes by millimetres
 KNOT_SPACING = 0.1  # [s]
-SOLVE_PROBES = {"upper_arm": 20, "forearm": 16, "hand": 12, "thigh": 24, "calf": 12}  # per pair, of those looked at
+SOLVE_PROBES = {"upper_arm": 20, "forearm": 16, "hand": 12, "thigh": 20, "calf": 20}  # per pair, of those looked at
 ALLOWED_EXCESS = 0.007  # [m]
 MARGIN = 0.001  # [m]
 SIGMA_DEPTH = 0.01  # [m]

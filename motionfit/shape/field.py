@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
-from scipy.ndimage import gaussian_filter1d, spline_filter
+from scipy.ndimage import gaussian_filter, gaussian_filter1d, spline_filter
 from scipy.spatial.transform import Rotation
 
+from motionfit import rotation
 from motionfit._character import PARTS, Character
 from motionfit._motion import Kinematics, Motion, bind_pose, host_kinematics, rest_motion
 from motionfit._skeleton import SIDES, Skeleton
@@ -28,57 +29,80 @@ from motionfit.shape.volumes import bone_tips
 GRID = {"torso": (28, 44, 26)}
 LIMB_GRID = (18, 30, 18)
 MARGIN = 0.03  # [m] of grid around the part
+FADE = 12.0  # of the depth with the winding number, where a part is cut from its neighbour
 
 
 class DepthField(eqx.Module):
-    """Depth [m] below a part's skin on a grid in the bind frame: positive inside, negative outside.
+    """Depth [m] below a part's skin on a grid, in the pose in which it was tabulated: positive inside.
 
     `coefficients` are those of a quadratic B-spline through the tabulated depths: once continuously differentiable.
-    World points are first taken to the bind pose through the part's `joints`. Along `axis_bind` each joint takes over
-    from the one before it between the heights `takeover` [m], so that a bent trunk is followed.
+    A world point is first taken home, to the tabulated pose, by the part's `joints`, whose frames there are
+    `home_rotations` and `home_positions`. The first ones are a chain: along `axis_home` each takes over from the one
+    before it between the heights `takeover` [m], so that a bent trunk is followed. The last two are the neighbours
+    that pull at the part's skin, as the arm at the shoulder and the thigh at the hip; `pulls` tabulates how much.
     """
 
     joints: Int[AnyArray, " blended"]
-    origin_bind: Float[AnyArray, "3"]
+    home_rotations: Float[AnyArray, "blended 3 3"]
+    home_positions: Float[AnyArray, "blended 3"]
+    origin: Float[AnyArray, "3"]
     spacing: Float[AnyArray, "3"]
     coefficients: Float[AnyArray, "nx ny nz"]
-    axis_bind: Float[AnyArray, "3"]
-    takeover: Float[AnyArray, "blended-1 2"]
+    pulls: Float[AnyArray, "2 nx ny nz"]
+    axis_home: Float[AnyArray, "3"]
+    takeover: Float[AnyArray, "_ 2"]
 
-    def depth_bind(self, points_bind: Sequence[Float[AnyArray, "*points"]]) -> Float[Array, "*points"]:
-        """Depth [m] of points given in the bind pose, one array per coordinate."""
-        origin, spacing = jnp.asarray(self.origin_bind), jnp.asarray(self.spacing)
-        cells = [(points_bind[a] - origin[a]) / spacing[a] for a in range(3)]
-        # half a cell is the spline's reach; outside, the distance to the grid counts as a gap
+    def depth_home(self, points_home: Sequence[Float[AnyArray, "*points"]]) -> Float[Array, "*points"]:
+        """Depth [m] of points given in the tabulated pose, one array per coordinate."""
+        inside, gap = self._cells(points_home)
+        return _lookup(jnp.asarray(self.coefficients)[None], *inside)[0] - gap
+
+    def _cells(self, points_home) -> tuple[list[Array], Array]:
+        """Grid coordinates clipped to the grid, and the distance [m] to it, which counts as a gap."""
+        origin, spacing = jnp.asarray(self.origin), jnp.asarray(self.spacing)
+        cells = [(points_home[a] - origin[a]) / spacing[a] for a in range(3)]
+        # half a cell is the spline's reach
         inside = [jnp.clip(c, 0.5, n - 1.5001) for c, n in zip(cells, self.coefficients.shape, strict=True)]
-        gap = sum(jnp.abs(cells[a] - inside[a]) * spacing[a] for a in range(3))
-        return _lookup(jnp.asarray(self.coefficients), *inside) - gap
+        return inside, sum(jnp.abs(cells[a] - inside[a]) * spacing[a] for a in range(3))
 
-    def to_bind(self, kin: Kinematics, points_world: Float[Array, "3 frames points"]) -> list[Array]:
-        """World points taken into the bind pose of this part, one array per coordinate.
+    def to_home(self, kin: Kinematics, points_world: Float[Array, "3 frames points"]) -> list[Array]:
+        """World points taken to the tabulated pose, one array per coordinate.
 
         Written out one component at a time: long contiguous vectors, where a trailing axis of 3 or a sum over a
-        leading one is several times slower on the CPU.
+        leading one is several times slower on the CPU. The barriers keep XLA from computing what all points share
+        anew for each of them.
         """
-        chain = jnp.asarray(self.joints)
-        turn, shift = kin.skin_rotations[:, chain], kin.skin_translations[:, chain]  # M_j B_j^-1
-        moved = []
-        for j in range(len(self.joints)):
-            gap = [points_world[b] - shift[:, j, b, None] for b in range(3)]
-            moved.append([sum(turn[:, j, b, a, None] * gap[b] for b in range(3)) for a in range(3)])
-        if len(moved) == 1:
-            return moved[0]
-        axis, heights = jnp.asarray(self.axis_bind), jnp.asarray(self.takeover)
-        height = sum(axis[a] * sum(m[a] for m in moved) / len(moved) for a in range(3))
-        shares = [_smoothstep((height - low) / (high - low)) for low, high in heights]
-        return [
-            moved[0][a] + sum(s * (m[a] - before[a]) for s, before, m in zip(shares, moved, moved[1:], strict=False))
-            for a in range(3)
-        ]
+        joints = jnp.asarray(self.joints)
+        turns = jnp.asarray(self.home_rotations) @ jnp.swapaxes(
+            rotation.to_matrix(kin.rotations_world[:, joints]), -1, -2
+        )
+        places = kin.positions_world[:, joints]
+        shifts = jnp.asarray(self.home_positions) - jnp.sum(turns * places[:, :, None, :], axis=-1)
+        turns, shifts = _once((turns, shifts))
+        moved = _once([
+            [shifts[:, j, a, None] + sum(turns[:, j, a, b, None] * points_world[b] for b in range(3)) for a in range(3)]
+            for j in range(len(self.joints))
+        ])  # fmt: skip
+        *chain, first, second = moved
+        home = chain[0]
+        if len(chain) > 1:
+            axis = jnp.asarray(self.axis_home)
+            height = sum(axis[a] * sum(m[a] for m in chain) / len(chain) for a in range(3))
+            shares = _once([_smoothstep((height - low) / (high - low)) for low, high in jnp.asarray(self.takeover)])
+            home = [
+                home[a] + sum(s * (m[a] - before[a]) for s, before, m in zip(shares, chain, chain[1:], strict=False))
+                for a in range(3)
+            ]
+        inside, _ = self._cells(home)
+        pulls = _once(_lookup(jnp.asarray(self.pulls), *inside))
+        return [h + pulls[0] * (f - h) + pulls[1] * (g - h) for h, f, g in zip(home, first, second, strict=True)]
 
     def depth(self, kin: Kinematics, points_world: Float[Array, "3 frames points"]) -> Float[Array, "frames points"]:
         """Depth [m] of world points below the posed part's skin; negative outside."""
-        return self.depth_bind(self.to_bind(kin, points_world))
+        return self.depth_home(self.to_home(kin, points_world))
+
+
+_once = jax.lax.optimization_barrier
 
 
 def _smoothstep(x):
@@ -97,51 +121,62 @@ def _weights(offset) -> tuple:
     return 0.5 * (0.5 - offset) ** 2, 0.75 - offset * offset, 0.5 * (0.5 + offset) ** 2
 
 
+def _slopes(offset) -> tuple:
+    return offset - 0.5, -2.0 * offset, offset + 0.5
+
+
 def _dot(a, b):
     return sum(x * y for x, y in zip(a, b, strict=True))
 
 
+_COLUMNS = np.array([(a, b) for a in range(3) for b in range(3)], np.int32)
+
+
 @eqx.filter_custom_jvp
-def _lookup(coefficients, x, y, z):
-    """Triquadratic B-spline at grid coordinates: 27 neighbours."""
-    _, ny, nz = coefficients.shape
-    offsets, base = _cells(coefficients.shape, (x, y, z))
-    wx, wy, wz = (_weights(o) for o in offsets)
-    flat = coefficients.reshape(-1)
+def _lookup(tables, x, y, z):
+    """Triquadratic B-splines, (tables, points...), at grid coordinates: 27 neighbours, scanned column by column so
+    that the program stays small."""
+    offsets, base = _cells(tables.shape[1:], (x, y, z))
+    wx, wy = (jnp.stack(_weights(o)) for o in offsets[:2])
 
-    def column(a, b):
-        return [flat.at[base + ((a * ny + b) * nz + c)].get(mode="promise_in_bounds") for c in range(3)]
+    def column(total, at):
+        a, b = at
+        along = _along(tables, base, a, b, _weights(offsets[2]))
+        return total + wx[a] * wy[b] * along, None
 
-    return _dot(wx, [_dot(wy, [_dot(wz, column(a, b)) for b in range(3)]) for a in range(3)])
+    return jax.lax.scan(column, jnp.zeros((len(tables), *x.shape), x.dtype), tuple(_COLUMNS.T))[0]
+
+
+def _along(tables, base, a, b, weights):
+    """The weighted three neighbours along z in column (a, b)."""
+    _, _, ny, nz = tables.shape
+    flat, place = tables.reshape(len(tables), -1), base + (a * ny + b) * nz
+    return _dot(weights, [flat.at[:, place + c].get(mode="promise_in_bounds") for c in range(3)])
 
 
 @_lookup.def_jvp
 def _lookup_jvp(primals, tangents):
     """The gradient in closed form, once: every further tangent is then three products per point."""
-    coefficients, x, y, z = primals
-    t_coefficients, *t_points = tangents
-    _, ny, nz = coefficients.shape
-    offsets, base = _cells(coefficients.shape, (x, y, z))
+    tables, x, y, z = primals
+    t_tables, *t_points = tangents
     # neither the offsets nor the gradient may be computed anew for each of the tangents
-    offsets, base = jax.lax.optimization_barrier((offsets, base))
-    wx, wy, wz = (_weights(o) for o in offsets)
-    sx, sy, sz = ((o - 0.5, -2.0 * o, o + 0.5) for o in offsets)
-    flat = coefficients.reshape(-1)
-    rows = []
-    for a in range(3):
-        columns = [
-            [flat.at[base + ((a * ny + b) * nz + c)].get(mode="promise_in_bounds") for c in range(3)] for b in range(3)
-        ]
-        along, steep = [_dot(wz, c) for c in columns], [_dot(sz, c) for c in columns]
-        rows.append((_dot(wy, along), _dot(sy, along), _dot(wy, steep)))
-    level, across, along = zip(*rows, strict=True)
-    value, *gradient = jax.lax.optimization_barrier((_dot(wx, level), _dot(sx, level), _dot(wx, across), _dot(wx, along)))
+    offsets, base = _once(_cells(tables.shape[1:], (x, y, z)))
+    (wx, wy, wz), (sx, sy, sz) = (tuple(jnp.stack(f(o)) for o in offsets) for f in (_weights, _slopes))
+
+    def column(totals, at):
+        a, b = at
+        level, steep = _along(tables, base, a, b, wz), _along(tables, base, a, b, sz)
+        parts = wx[a] * wy[b] * level, sx[a] * wy[b] * level, wx[a] * sy[b] * level, wx[a] * wy[b] * steep
+        return tuple(t + p for t, p in zip(totals, parts, strict=True)), None
+
+    zero = jnp.zeros((len(tables), *x.shape), x.dtype)
+    value, *gradient = _once(jax.lax.scan(column, (zero,) * 4, tuple(_COLUMNS.T))[0])
     tangent = jnp.zeros_like(value)
     for slope, t in zip(gradient, t_points, strict=True):
         if t is not None:
             tangent = tangent + slope * t
-    if t_coefficients is not None:
-        tangent = tangent + _lookup(t_coefficients, x, y, z)
+    if t_tables is not None:
+        tangent = tangent + _lookup(t_tables, x, y, z)
     return value, tangent
 
 
@@ -234,15 +269,16 @@ def standing_vertices(character: Character) -> Float[np.ndarray, "vertices 3"]:
     return np.einsum("vk,vka->va", weights, moved)
 
 
-def fit_field(character: Character, part: str) -> DepthField:
-    """Tabulate the depth below a part's skin.
+def fit_field(character: Character, part: str, side: str = "left") -> DepthField:
+    """Tabulate the depth below a part's skin, in the `standing` pose.
 
     The sign is that of the generalised winding number about 1/2. Where a part is cut from its neighbour the winding
-    number passes 1/2 smoothly and the depth is faded with it, so that the cut is no wall.
+    number passes 1/2 smoothly and the depth is faded with it, so that the cut is no wall. `side` says whose arm and
+    thigh pull at the trunk.
     """
     import igl
 
-    surface = part_surface(character, part)
+    skeleton, surface = character.skeleton, part_surface(character, part)
     if len(surface.vertices) < 50 or len(surface.triangles) == 0:
         raise InputError(f"{character.name}: part {part!r} has {len(surface.vertices)} vertices, too few to fit a "
                          "volume; check the skin weights and the role mapping")  # fmt: skip
@@ -253,14 +289,30 @@ def fit_field(character: Character, part: str) -> DepthField:
     axes = [low[a] + spacing[a] * np.arange(shape[a]) for a in range(3)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     winding = np.asarray(igl.fast_winding_number(vertices, surface.triangles, nodes))
-    squared = np.asarray(igl.point_mesh_squared_distance(nodes, vertices, surface.triangles)[0])
-    depth = np.sqrt(np.maximum(squared, 0.0)) * np.clip(4.0 * (winding - 0.5), -1.0, 1.0)
-    coefficients = spline_filter(depth.reshape(shape), order=2)
-    chain, axis, takeover = _blend(character, part, surface.vertices)
-    return DepthField(np.array(chain), low, spacing, coefficients, axis, takeover)
+    squared, nearest, _ = igl.point_mesh_squared_distance(nodes, vertices, surface.triangles)
+    depth = np.sqrt(np.maximum(squared, 0.0)) * np.clip(FADE * (winding - 0.5), -1.0, 1.0)
+    chain, axis, takeover = _chain(character, part, surface.vertices)
+    own, _, kind = part.partition("_")
+    around = {"torso": (f"{side}_upper_arm", f"{side}_thigh"), "thigh": ("hips", f"{own}_calf"),
+              "calf": (f"{own}_thigh", f"{own}_foot"), "foot": (f"{own}_calf", f"{own}_toe")}.get(
+        part if part == "torso" else kind, (part, part))  # fmt: skip
+    joints, weights = np.asarray(character.skin.joints)[surface.used], np.asarray(character.skin.weights, float)
+    pulls = []
+    for role in around:
+        pulling = [j for j in range(len(skeleton.names)) if skeleton.nearest_role(j) == role]
+        pull = np.where(np.isin(joints, pulling), weights[surface.used], 0.0).sum(-1)
+        at_nodes = pull[surface.triangles].mean(-1)[np.asarray(nearest)].reshape(shape)
+        pulls.append(gaussian_filter(at_nodes, 0.5) if role != part else np.zeros(shape))
+    frames = (*chain, *(skeleton.find(role) if skeleton.find(role) is not None else chain[0] for role in around))
+    positions, rotations = (x[0] for x in host_kinematics(standing(skeleton)))
+    home = Rotation.from_quat(rotations, scalar_first=True).as_matrix()
+    return DepthField(
+        np.array(frames), home[list(frames)], positions[list(frames)], low, spacing,
+        spline_filter(depth.reshape(shape), order=2), np.stack(pulls), axis, takeover,
+    )  # fmt: skip
 
 
-def _blend(character: Character, part: str, mine: np.ndarray) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:
+def _chain(character: Character, part: str, mine: np.ndarray) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:
     """The joints that carry a part, its axis, and the heights [m] between which each joint takes over."""
     skeleton, skin = character.skeleton, character.skin
     positions, tips = bind_pose(skeleton)[0], bone_tips(skeleton)
@@ -314,8 +366,8 @@ class Probes(eqx.Module):
 
     def positions_world(self, kin: Kinematics) -> Float[Array, "3 frames points"]:
         """World positions [m], coordinates first."""
-        chain = jnp.asarray(self.joints)
-        moves = jnp.concatenate([kin.skin_rotations[:, chain], kin.skin_translations[:, chain, :, None]], axis=-1)
+        turns, shifts = kin.skin_transforms(jnp.asarray(self.joints))
+        moves = jnp.concatenate([turns, shifts[..., None]], axis=-1)
         blend = jnp.asarray(self.blend, moves.dtype)
         frames, carrying = moves.shape[:2]
         rows = jnp.moveaxis(moves, 2, 0).reshape(3 * frames, carrying * 4)

@@ -5,6 +5,7 @@ body in the same frame (method: adjacent segments always overlap a little at the
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -101,13 +102,19 @@ class SkinClearance(Term):
         """Depth [m] of every point, set by set; negative outside."""
         points = [p.positions_world(kin) for p in self.probes]
         depths: list[Array] = [jnp.zeros(())] * len(points)
+        # fields of one shape are looked up together, each over all the probes that meet it: the program stays small
+        meeting = [[i for i, owner in enumerate(self.field_of) if owner == k] for k in range(len(self.fields))]
+        met = [jnp.concatenate([points[i] for i in some], axis=2) for some in meeting]
+        alike: dict[tuple, list[int]] = {}
         for k, field in enumerate(self.fields):
-            # each field once over all the probes that meet it: the program stays small
-            meeting = [i for i, owner in enumerate(self.field_of) if owner == k]
-            split = np.cumsum([points[i].shape[2] for i in meeting])[:-1]
-            met = field.depth(kin, jnp.concatenate([points[i] for i in meeting], axis=2))
-            for i, depth in zip(meeting, jnp.split(met, split, axis=1), strict=True):
-                depths[i] = depth
+            alike.setdefault((met[k].shape, *(jnp.shape(x) for x in jax.tree.leaves(field))), []).append(k)
+        for group in alike.values():
+            fields = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(y) for y in x]), *(self.fields[k] for k in group))
+            together = jax.vmap(lambda field, p: field.depth(kin, p))(fields, jnp.stack([met[k] for k in group]))
+            for k, depth in zip(group, together, strict=True):
+                split = np.cumsum([points[i].shape[2] for i in meeting[k]])[:-1]
+                for i, part in zip(meeting[k], jnp.split(depth, split, axis=1), strict=True):
+                    depths[i] = part
         return depths
 
     def depth(self, kin: Kinematics) -> Float[Array, "frames sets"]:
