@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from motionfit._character import Character
 from motionfit._control import Control, Correction
-from motionfit._fit import Block, Fit, fit
+from motionfit._fit import Block, BlockReport, Fit, fit
 from motionfit._motion import Motion, bucket, host_kinematics
 from motionfit._onto import onto
 from motionfit._problem import During, Problem, Term
@@ -20,7 +20,7 @@ from motionfit.adapt._controls import arm_controls, leg_controls
 from motionfit.metrics import TOLERANCE
 from motionfit.shape.field import standing
 from motionfit.shape.growth import grow
-from motionfit.shape.pairs import Pair, pairs_of
+from motionfit.shape.pairs import PAIRS, Pair, pairs_of
 from motionfit.splines import Basis, bspline_basis
 from motionfit.terms.pose import Effort, Smoothness
 

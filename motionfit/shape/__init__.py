@@ -1,9 +1,9 @@
 """Body shape: volumes fitted to the skin, their distances, girth, and the built-in bodies."""
 
 from motionfit.shape.distance import capsule_depth, cylinder_depth, segment_distance
-from motionfit.shape.field import DepthField, Probes, fit_field, sample_probes
 from motionfit.shape.growth import grow, parse_girth
 from motionfit.shape.pairs import PAIRS, Pair
+from motionfit.shape.field import DepthField, Probes, fit_field, sample_probes
 from motionfit.shape.volumes import Volumes, allocate_vertices, fit_volumes
 
 __all__ = [
