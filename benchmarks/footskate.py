@@ -11,7 +11,6 @@ as it is, over the legs' length, the acceleration ratio, the deepest penetration
 
 import argparse
 import pathlib
-import sys
 import time
 
 import numpy as np
@@ -20,8 +19,6 @@ import motionfit as mf
 from motionfit.feet import METHODS
 from motionfit.metrics import derivative_ratio
 from motionfit.shape.growth import grow
-
-sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
 from tests.helpers import with_legs
 
 CLIPS = (
