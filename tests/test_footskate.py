@@ -156,6 +156,33 @@ def test_hierarchy_that_starts_at_a_foot(seed):
     np.testing.assert_allclose(np.abs((same * np.asarray(motion.rotations)[:, 0]).sum(1)), 1.0, atol=1e-12)
 
 
+@pytest.mark.parametrize("method", ["root", "leg-ik", "adaptive"])
+def test_animated_translations_are_heeded_and_kept(average, method):
+    walk = samples.walk(cycles=1)
+    still = np.repeat(np.asarray(walk.skeleton.offsets)[None], walk.frame_count, axis=0)
+    moving = mf.Motion(walk.skeleton, walk.root, walk.rotations, walk.dt, still)
+    found, plain = (mf.remove_footskate(m, average, method) for m in (moving, walk))
+    assert found.motion.translations is still
+    np.testing.assert_allclose(found.motion.root, plain.motion.root, atol=1e-9)
+    np.testing.assert_allclose(found.motion.rotations, plain.motion.rotations, atol=1e-9)
+
+
+def test_both_feet_that_never_move_change_nothing(average):
+    """Standing with feet at different heights (one on a plank): nothing to correct, so nothing is."""
+    rest = rest_motion(average.skeleton, 1 / 60)
+    rotations = np.repeat(np.asarray(rest.rotations), 60, axis=0)
+    arm = average.skeleton.joint("left_upper_arm")
+    wave = Rotation.from_rotvec(np.sin(np.arange(60) / 9)[:, None] * [0.3, 0.0, 0.2])
+    rotations[:, arm] = (wave * Rotation.from_quat(rotations[:, arm], scalar_first=True)).as_quat(scalar_first=True)
+    knee = average.skeleton.joint("right_calf")
+    bent = Rotation.from_rotvec([0.1, 0, 0]) * Rotation.from_quat(rotations[:, knee], scalar_first=True)
+    rotations[:, knee] = bent.as_quat(scalar_first=True)
+    motion = mf.Motion(average.skeleton, np.repeat(np.asarray(rest.root), 60, axis=0), rotations, 1 / 60)
+    found = mf.remove_footskate(motion, average)
+    np.testing.assert_allclose(found.motion.root, motion.root, atol=SAME)
+    assert found.details["scale"] == 1.0
+
+
 def test_single_precision_agrees(average):
     """A motion of JAX's own arrays, as a fit returns it: the rotations are still the very same object."""
     walk = samples.walk(cycles=2)
