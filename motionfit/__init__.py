@@ -8,7 +8,7 @@ mf.save("adapted.glb", fit.motion, mf.load_character("heavy.glb"))
 
 __version__ = "0.1.0"
 
-from motionfit import adapt, metrics, shape, terms
+from motionfit import adapt, feet, ik, metrics, shape, terms
 from motionfit import rotation as rotation
 from motionfit import splines as splines
 from motionfit._character import Character as Character
@@ -34,6 +34,8 @@ from motionfit._skeleton import Skeleton as Skeleton
 from motionfit._skinning import Skin as Skin
 from motionfit._skinning import skin as skin
 from motionfit._types import InputError as InputError
+from motionfit.feet._remove import detect_footplants as detect_footplants
+from motionfit.feet._remove import remove_footskate as remove_footskate
 from motionfit.io import load_character as load_character
 from motionfit.io import load_motion as load_motion
 from motionfit.io import save as save
@@ -41,7 +43,7 @@ from motionfit.metrics import measure as measure
 
 __all__ = [
     "Block", "Character", "Control", "Correction", "Custom", "Drive", "During", "Energy", "Fit", "InputError",
-    "Kinematics", "Motion", "Problem", "Robust", "Skeleton", "Skin", "Term", "adapt", "fit", "forward_kinematics",
-    "load_character", "load_correction", "load_motion", "measure", "metrics", "onto", "resample", "rotation", "save",
-    "shape", "skin", "splines", "terms",
+    "Kinematics", "Motion", "Problem", "Robust", "Skeleton", "Skin", "Term", "adapt", "detect_footplants", "feet", "fit",
+    "forward_kinematics", "ik", "load_character", "load_correction", "load_motion", "measure", "metrics", "onto",
+    "remove_footskate", "resample", "rotation", "save", "shape", "skin", "splines", "terms",
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""The command line: demo, adapt, metrics, inspect.
+"""The command line: demo, adapt, metrics, inspect, footskate.
 
 Bad input ends with one line on stderr and status 2; a violation that is left over the tolerance with status 3.
 """
@@ -98,6 +98,62 @@ def inspect(file: Annotated[str, typer.Argument(help="a clip or a character")]) 
         text = ", ".join(value) if isinstance(value, list) else str(value)
         typer.echo(f"{key:<20} {text}")
     typer.echo(f"{'roles':<20} {', '.join(f'{r}={n}' for r, n in roles.items()) or 'none'}")
+
+
+@app.command()
+def footskate(
+    clip: ClipArgument,
+    character: CharacterArgument,
+    out: Annotated[pathlib.Path, typer.Option("-o", "--out", help="output: .glb, .gltf, .bvh or .npz")],
+    method: Annotated[str, typer.Option(help="root, leg-ik or adaptive")] = "root",
+    labels: Annotated[pathlib.Path | None, typer.Option(help="footplants, CSV: foot,vertex,start,end")] = None,
+    floor: Annotated[float | None, typer.Option(help="height that the feet shall stand on [m]")] = None,
+    report: Annotated[pathlib.Path | None, typer.Option(help="write report.json here")] = None,
+    plot: Annotated[pathlib.Path | None, typer.Option(help="draw the footprints before and after here")] = None,
+    save_labels: Annotated[pathlib.Path | None, typer.Option(help="write the footplants that were used here")] = None,
+) -> None:
+    """Make the planted feet of CLIP on CHARACTER hold still."""
+    import numpy as np
+
+    import motionfit as mf
+    from motionfit.io import CLIPS, _ending
+
+    _ending(out, CLIPS, "an output")
+    for target in (out, report, plot, save_labels):
+        if target is not None and not target.parent.is_dir():
+            raise mf.InputError(f"{target}: its folder does not exist; make it first: mkdir -p {target.parent}")
+    started = time.perf_counter()
+    motion, body = _load_clip(clip), mf.load_character(character)
+    loaded = time.perf_counter() - started
+    found = mf.remove_footskate(motion, body, method, labels=labels, floor=floor)
+    solved = time.perf_counter() - started - loaded
+    mf.save(out, found.motion, body)
+    if save_labels is not None:
+        found.plants.save(save_labels)
+    feet = found.report()
+    measured = {}
+    for name, m in (("before", found.base), ("after", found.motion)):
+        measured[name] = mf.measure(m, found.base) | {"feet": feet.pop(name)["feet"]}
+    total = time.perf_counter() - started
+    if report is not None:
+        _write_json(report, {
+            "schema": 1, "motionfit": mf.__version__, "clip": clip, "character": character, "girth": {},
+            "frames": found.base.frame_count, "frame_rate": found.base.frame_rate,
+            "joints": len(body.skeleton.names), "vertices": len(body.skin.vertices_bind),
+            "device": "cpu", "dtype": str(np.asarray(found.motion.root).dtype),
+            "time_s": {"load": loaded, "compile": 0.0, "solve": solved, "blocks": {"footskate": solved}, "total": total},
+            "status": found.status, "blocks": [{"name": "footskate", "status": found.status}],
+            "footskate": feet, **measured,
+        })  # fmt: skip
+    if plot is not None:
+        from motionfit.view import footprints_picture
+
+        footprints_picture(plot, found, f"{clip} on {body.name}: {method}")
+    _print_feet(measured)
+    typer.echo(f"{found.status.replace('_', ' ')} in {total:.1f} s; "
+               f"wrote {', '.join(str(p) for p in (out, report, plot, save_labels) if p)}")  # fmt: skip
+    if found.status != "converged":
+        raise typer.Exit(3)
 
 
 # --- what the commands share ------------------------------------------------------------------------------------
@@ -276,6 +332,26 @@ def _print_table(columns: dict[str, dict]) -> None:
     line("mean joint deviation (deg)", "fidelity", "joint_angle_mean_rad", scale=180 / math.pi, form="{:.2f}")
     line("forearm direction (deg)", "fidelity", "forearm_direction_mean_rad", scale=180 / math.pi)
     line("jerk ratio", "smoothness", "jerk_ratio", form="{:.3f}")
+    Console(width=100).print(table)
+
+
+def _print_feet(columns: dict[str, dict]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(show_edge=False, pad_edge=False)
+    table.add_column("")
+    for name in columns:
+        table.add_column(name, justify="right")
+    for label, key, scale, form in (
+        ("planted foot slides, 95 % under (mm/s)", "slide_p95_m_s", 1000, "{:.1f}"),
+        ("planted foot slides, in all (cm)", "slide_path_m", 100, "{:.1f}"),
+        ("frames with a foot down", "contact_frames", 1, "{}"),
+        ("deepest under the floor (cm)", "ground_penetration_max_m", 100, "{:.1f}"),
+        ("highest over it when down (cm)", "floating_max_m", 100, "{:.1f}"),
+    ):
+        values = [m["feet"][key] for m in columns.values()]
+        table.add_row(label, *("-" if v is None else form.format(scale * v) for v in values))
     Console(width=100).print(table)
 
 

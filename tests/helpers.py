@@ -1,10 +1,12 @@
 """Random skeletons and motions, and independent oracles."""
 
+import equinox as eqx
 import numpy as np
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from motionfit import Motion, Skeleton
+from motionfit import Character, Motion, Skeleton, Skin
+from motionfit._motion import bind_pose, rest_motion
 
 
 def random_motion(seed: int, joints: int, frames: int, rate: float = 60.0) -> Motion:
@@ -44,3 +46,35 @@ def central_difference(fn, x: np.ndarray, step: float = 1e-6) -> np.ndarray:
         down[i] -= step
         gradient[i] = (float(fn(up)) - float(fn(down))) / (2 * step)
     return gradient
+
+
+def with_legs(character: Character, scale: float) -> Character:
+    """The character with thighs and calves `scale` times as long, standing on the same floor; skin stretched along."""
+    skeleton, skin = character.skeleton, character.skin
+    old = bind_pose(skeleton)[0]
+    offsets, stretch = np.array(skeleton.offsets, float), np.zeros((len(old), 3, 3))
+    for side in ("left", "right"):
+        for joint, end in (("thigh", "calf"), ("calf", "foot")):
+            a, b = (skeleton.joint(f"{side}_{r}") for r in (joint, end))
+            bone = (old[b] - old[a]) / np.linalg.norm(old[b] - old[a])
+            stretch[a] = (scale - 1.0) * np.outer(bone, bone)
+            offsets[b] *= scale
+    foot = skeleton.joint("left_foot")
+    lowered = bind_pose(eqx.tree_at(lambda s: s.offsets, skeleton, offsets))[0][foot, 1]
+    offsets[0, 1] += old[foot, 1] - lowered
+    longer = eqx.tree_at(lambda s: s.offsets, skeleton, offsets)
+    joints, weights, vertices = np.asarray(skin.joints), np.asarray(skin.weights), np.asarray(skin.vertices_bind)
+    moved = vertices + np.einsum("vk,vka->va", weights, (bind_pose(longer)[0] - old)[joints])
+    moved = moved + np.einsum("vk,vkab,vkb->va", weights, stretch[joints], vertices[:, None] - old[joints])
+    return Character(longer, Skin(moved, skin.faces, skin.joints, skin.weights), f"{character.name} legs {scale:g}")
+
+
+def jumping(body: Character, height: float, rate: float = 60.0) -> tuple[Motion, np.ndarray]:
+    """The bind pose standing, in ballistic flight, and standing; with the frames in the air."""
+    rest = rest_motion(body.skeleton, 1 / rate)
+    flight = np.sqrt(8 * height / 9.81)
+    times = np.arange(round((1.0 + flight) * rate)) / rate - 0.5
+    up = np.where((times > 0) & (times < flight), 9.81 / 2 * times * (flight - times), 0.0)
+    root = np.asarray(rest.root) + up[:, None] * [0.0, 1.0, 0.0] + np.clip(times, 0, flight)[:, None] * [0.0, 0.0, 0.8]
+    rotations = np.repeat(np.asarray(rest.rotations), len(times), axis=0)
+    return Motion(body.skeleton, root, rotations, 1 / rate), up > 0

@@ -1,0 +1,297 @@
+"""Footplants enforced by prioritized inverse kinematics: Glardon, Boulic & Thalmann 2006, section 5."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
+
+from motionfit._motion import Motion, bind_pose, host_kinematics, rest_motion
+from motionfit.feet._classics import foot_joints
+from motionfit.feet._cycles import Constraint, find_constraints
+from motionfit.feet._floor import Floor
+from motionfit.feet._leg import Leg, find_legs, lowering
+from motionfit.feet._plants import Footplants
+from motionfit.feet._sole import Sole, sole_paths
+from motionfit.ik import Task, move_limb, prioritized
+
+EASE = 0.16  # [s] sigma of (9)
+KNEE = (0.0, 2.7)  # [rad] how far a knee bends
+ANKLE = 1.2  # [rad] how far the ankle may be turned away from the clip, about each of its axes
+HIP = 1.0  # [rad] and the hip
+REACHED = 1e-4  # [m]
+
+
+def descending_step(t: Float[np.ndarray, "..."] | float) -> Float[np.ndarray, "..."] | float:
+    """The descending cubic step 2t^3 - 3t^2 + 1 of (10), from 1 to 0 over 0..1."""
+    t = np.clip(t, 0.0, 1.0)
+    return (2 * t - 3) * t * t + 1
+
+
+def effector_path(
+    own: Float[np.ndarray, "frames 3"],
+    goals: list[tuple[int, int, Float[np.ndarray, "3"]]],
+    ease: int,
+    *,
+    smooth_speed: bool = True,
+) -> Float[np.ndarray, "frames 3"]:
+    """The path [m] of an effector that holds each goal (start, end, position) and eases in and out: (9).
+
+    `own` is its original path E_0 and `ease` the frames sigma of an ease, shortened where two constraints are near
+    to each other. Printed as it is, (9) arrives with the speed that the original has at t_1 and stops dead;
+    `smooth_speed` takes that speed out over the ease, by the cubic with zero ends and that slope.
+    """
+    path = np.array(own, float)
+    frames = len(own)
+    slope = np.gradient(own, axis=0) if frames > 1 else np.zeros_like(path)
+    for k, (start, end, goal) in enumerate(goals):
+        before = start - goals[k - 1][1] if k else start + ease
+        after = goals[k + 1][0] - end if k + 1 < len(goals) else frames - 1 - end + ease
+        into, out = min(ease, max(before // 2, 1)), min(ease, max(after // 2, 1))
+        t = np.arange(max(start - into, 0), start)
+        s = ((t - start + into) / into)[:, None]
+        path[t] += (1 - descending_step(s)) * (goal - own[start])
+        if smooth_speed:
+            path[t] -= into * slope[start] * (s**3 - s**2)
+        path[start : end + 1] = goal
+        t = np.arange(end + 1, min(end + out, frames - 1) + 1)
+        s = ((t - end) / out)[:, None]
+        path[t] += descending_step(s) * (goal - own[end])
+        if smooth_speed:
+            path[t] -= out * slope[end] * (s**3 - 2 * s**2 + s)
+    return path
+
+
+class Chain(NamedTuple):
+    """One leg from the hip to the toe: world positions and rotations of a frame batch, and the axes of its six
+    degrees of freedom: three at the hip, one at the knee, two at the ankle."""
+
+    hip: np.ndarray
+    thigh: np.ndarray
+    shank: np.ndarray
+    foot: np.ndarray  # ankle to toe
+    knee_axis: np.ndarray
+    ankle_axes: np.ndarray  # (frames, 2, 3)
+
+
+def chain_pose(
+    chain: Chain, values: np.ndarray
+) -> tuple[Rotation, Rotation, Rotation, np.ndarray, np.ndarray, np.ndarray]:
+    """Turns of thigh, shank and foot (rotation vectors from the clip's pose on), with knee, ankle and toe."""
+    upper = Rotation.from_rotvec(values[:, :3])
+    lower = upper * Rotation.from_rotvec(values[:, 3:4] * chain.knee_axis)
+    end = lower * Rotation.from_rotvec(np.einsum("fk,fka->fa", values[:, 4:6], chain.ankle_axes))
+    knee = chain.hip + upper.apply(chain.thigh)
+    ankle = knee + lower.apply(chain.shank)
+    return upper, lower, end, knee, ankle, ankle + end.apply(chain.foot)
+
+
+def _left_jacobian(vector: np.ndarray) -> np.ndarray:
+    """How the rotation of a rotation vector turns when the vector changes, in the frame it turns into."""
+    angle = np.linalg.norm(vector, axis=1)[:, None, None]
+    x, y, z = vector.T
+    zero = np.zeros_like(x)
+    cross = np.stack([np.stack(r, -1) for r in ((zero, -z, y), (z, zero, -x), (-y, x, zero))], 1)
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
+    b = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
+    return np.eye(3) + a * cross + b * cross @ cross
+
+
+def chain_effectors(
+    chain: Chain, values: np.ndarray
+) -> tuple[Float[np.ndarray, "effectors batch 3"], Float[np.ndarray, "effectors batch 3 6"]]:
+    """Where ankle and toe are [m], and how the six values move them."""
+    upper, lower, _, knee, ankle, toe = chain_pose(chain, values)
+    points = np.stack([ankle, toe])
+    jacobians = np.zeros((2, len(values), 3, 6))
+    hips = np.swapaxes(_left_jacobian(values[:, :3]), 1, 2)  # rows: world axes of the three hip values
+    jacobians[..., :3] = np.swapaxes(np.cross(hips, (points - chain.hip)[:, :, None]), 2, 3)
+    jacobians[..., 3] = np.cross(upper.apply(chain.knee_axis), points - knee)
+    vector = np.einsum("fk,fka->fa", values[:, 4:6], chain.ankle_axes)
+    axes = np.einsum("fab,fkb->fka", _left_jacobian(vector), chain.ankle_axes)
+    for k in range(2):
+        jacobians[1, :, :, 4 + k] = np.cross(lower.apply(axes[:, k]), toe - ankle)
+    return points, jacobians
+
+
+def chain_tasks(chain: Chain, goals: list[Float[np.ndarray, "batch 3"]]) -> list[Task]:
+    """Ankle first, then toe: errors [m] and Jacobians of the chain's values."""
+    last: list = [None, None]  # both tasks are asked for the same values in turn: their kinematics is done once
+
+    def task_of(part: int) -> Task:
+        def task(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            if last[0] is None or not np.array_equal(last[0], values):
+                last[:] = values.copy(), chain_effectors(chain, values)
+            points, jacobians = last[1]
+            return goals[part] - points[part], jacobians[part]
+
+        return task
+
+    return [task_of(part) for part in range(len(goals))]
+
+
+def enforce(
+    base: Motion, sole: Sole, plants: Footplants, target: Floor | None = None, lift: float | None = None
+) -> tuple[Motion, Bool[np.ndarray, "frames 2"], Bool[np.ndarray, "frames 2"], dict[str, float]]:
+    """Heel and toe of both feet held where adaptive thresholds find them constrained.
+
+    Per leg a chain of six degrees of freedom from hip to toe and two positional effectors: the ankle first, then
+    the toe, by prioritized inverse kinematics with damping and joint limits (5.1). Their paths are (9). A goal is
+    the effector's mean place over its constraint (the source takes the one at its beginning), put at the height over
+    the floor that the joint has in the bind pose. Where only one of both is held the other's path is drawn to the foot's length from it, so
+    that both can be met. The character comes down where a leg is too short.
+
+    Returns the motion, which feet are held by heel or toe, which heels could be brought to their goals, and details.
+    """
+    skeleton, dt = base.skeleton, float(base.dt)
+    floor = plants.floor if target is None else target
+    positions, rotations = host_kinematics(base)
+    if target is not None:
+        # the clip's floor is laid on the target's
+        rise = target.at(positions[:, 0]) - plants.floor.at(positions[:, 0])
+        positions = positions + np.array([0.0, 1.0, 0.0]) * rise[:, None, None]
+    joints = foot_joints(skeleton)
+    constraints = find_constraints(base, plants.floor, plants=plants.plants)
+    standing = bind_pose(skeleton)[0][:, 1] - sole_paths(sole, rest_motion(skeleton))[0, :, 1].min()
+    ease = max(1, round(EASE / dt))
+    paths, goals = [], []
+    for side, mine in enumerate(joints):
+        goals.append(_goals([c for c in constraints if c.foot == side], mine, positions, standing, floor, ease))
+        paths.append([effector_path(positions[:, j], goals[side][part], ease) for part, j in enumerate(mine)])
+        if len(mine) == 2:
+            _keep_foot_length(
+                paths[side][0], paths[side][1], goals[side], positions[:, mine[1]] - positions[:, mine[0]], ease
+            )
+    legs = find_legs(skeleton, positions, rotations)
+    down = lowering(legs, [p[0] for p in paths], dt) if lift is None else np.full(base.frame_count, float(lift))
+    positions = positions - np.array([0.0, 1.0, 0.0]) * down[:, None, None]
+    local, reachable = np.array(base.rotations, float), np.ones((base.frame_count, 2), bool)
+    held = np.zeros_like(reachable)
+    worst = [0.0, 0.0]
+    for side, (mine, leg) in enumerate(zip(joints, find_legs(skeleton, positions, rotations), strict=True)):
+        errors = _turn_leg(base, leg, mine, positions, rotations, paths[side], local)
+        for part, error in enumerate(errors):
+            for start, end, _ in goals[side][part]:
+                held[start : end + 1, side] = True
+                worst[part] = max(worst[part], float(error[start : end + 1].max()))
+                if part == 0:
+                    reachable[start : end + 1, side] = error[start : end + 1] < REACHED
+    details = {"lowered_max_m": float(down.max()), "constraints": float(len(constraints)),
+               "ankle_error_max_m": worst[0], "toe_error_max_m": worst[1]}  # fmt: skip
+    moved = Motion(skeleton, positions[:, 0].astype(np.asarray(base.root).dtype),
+                   local.astype(np.asarray(base.rotations).dtype), base.dt, base.translations)  # fmt: skip
+    return moved, held, reachable, details
+
+
+Goal = tuple[int, int, np.ndarray]
+
+
+def _goals(
+    constraints: list[Constraint],
+    joints: tuple[int, ...],
+    positions: np.ndarray,
+    standing: np.ndarray,
+    floor: Floor,
+    ease: int,
+) -> list[list[Goal]]:
+    """Per effector of a foot the goals (start, end, position), in order and at least an ease apart."""
+    goals: list[list[Goal]] = []
+    for part, joint in enumerate(joints):
+        found: list[Goal] = []
+        for c in sorted((c for c in constraints if c.part == part), key=lambda c: c.start):
+            start = c.start if not found else max(c.start, found[-1][1] + ease)
+            if start > c.end:
+                continue
+            goal = positions[start : c.end + 1, joint].mean(0)
+            goal[1] = floor.at(goal) + standing[joint]
+            end = c.end
+            if part == 1:
+                heels = [(a, g) for a, b, g in goals[0] if a <= c.end and b >= start]
+                # a heel that comes down elsewhere takes the toe along
+                end = min([end, *(a - ease for a, _ in heels[1:])])
+                if end < start:
+                    continue
+                if heels:
+                    heel = heels[0][1]
+                    # held together, they are as far apart as the foot is long
+                    length = np.linalg.norm(positions[start, joint] - positions[start, joints[0]])
+                    away = (goal - heel) * [1.0, 0.0, 1.0]
+                    level = np.sqrt(max(length**2 - (goal[1] - heel[1]) ** 2, 0.0))
+                    goal = heel + away * level / max(np.linalg.norm(away), 1e-9) + [0.0, goal[1] - heel[1], 0.0]
+            found.append((start, end, goal))
+        goals.append(found)
+    return goals
+
+
+def _keep_foot_length(ankle: np.ndarray, toe: np.ndarray, goals: list[list[Goal]], foot: np.ndarray, ease: int) -> None:
+    """Draw the path of the effector that is not held to the foot's length from the other one, in place.
+
+    Where the toe alone is held the ankle gives way; before (if it lands first) and after, the ankle comes back to its
+    own path within an ease. Everywhere else the toe gives way.
+    """
+    frames, length = np.arange(len(ankle)), np.linalg.norm(foot, axis=1, keepdims=True)
+    held = [np.zeros(len(ankle), bool) for _ in goals]
+    for mask, mine in zip(held, goals, strict=True):
+        for start, end, _ in mine:
+            mask[start : end + 1] = True
+    share = np.zeros(len(ankle))
+    for start, end, _ in goals[1]:
+        into = (start - frames) / ease if not held[0][start] else np.where(frames < start, 1.0, 0.0)
+        share = np.maximum(share, descending_step(np.maximum(np.maximum(into, (frames - end) / ease), 0.0)))
+    share[held[0]] = 0.0
+
+    def away() -> np.ndarray:
+        apart = toe - ankle
+        return apart * length / np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-9)
+
+    ankle += share[:, None] * (toe - away() - ankle)
+    toe[~held[1]] = (ankle + away())[~held[1]]
+
+
+def _turn_leg(
+    base: Motion, leg: Leg, joints: tuple[int, ...], positions: np.ndarray, rotations: np.ndarray,
+    paths: list[np.ndarray], local: np.ndarray,
+) -> list[Float[np.ndarray, " frames"]]:  # fmt: skip
+    """Bring a leg's effectors to their paths; writes joint rotations into `local`, returns the errors left [m]."""
+    thigh, calf, ankle = leg.joints
+    foot = positions[:, joints[1]] - leg.ankle if len(joints) == 2 else np.zeros_like(leg.ankle)
+    forward = foot / np.maximum(np.linalg.norm(foot, axis=1, keepdims=True), 1e-9)
+    side = leg.lateral - np.einsum("fa,fa->f", leg.lateral, forward)[:, None] * forward
+    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
+    chain = Chain(leg.hip, leg.knee - leg.hip, leg.ankle - leg.knee, foot, leg.lateral,
+                  np.stack([side, np.cross(forward, side)], axis=1))  # fmt: skip
+    bent = np.arctan2(np.einsum("fa,fa->f", np.cross(chain.thigh, chain.shank), leg.lateral),
+                      np.einsum("fa,fa->f", chain.thigh, chain.shank))  # fmt: skip
+    lower = np.tile([-HIP] * 3 + [0.0] + [-ANKLE] * 2, (len(bent), 1))
+    upper = -lower
+    # a knee that the clip has bent further, or the other way, may stay so
+    lower[:, 3], upper[:, 3] = np.minimum(KNEE[0] - bent, 0.0), np.maximum(KNEE[1] - bent, 0.0)
+    tasks = chain_tasks(chain, paths)
+    values = np.zeros((len(bent), 6))
+    # frames in which every effector already is where it should be are left alone, bit for bit
+    busy = np.max([np.abs(task(values)[0]).max(1) for task in tasks], axis=0) > 1e-12
+    if busy.any():
+        some = Chain(*(x[busy] for x in chain))
+        # the analytic leg is the start: from a straight knee no gradient says which way to bend
+        found = move_limb(leg.hip[busy], leg.knee[busy], leg.ankle[busy], paths[0][busy], leg.lateral[busy])
+        values[busy, :3] = found.upper.as_rotvec()
+        knee = (found.upper.inv() * found.lower).as_rotvec()
+        values[busy, 3] = np.einsum("fa,fa->f", knee, some.knee_axis)
+        values[busy] = prioritized(chain_tasks(some, [p[busy] for p in paths]), values[busy], lower=lower[busy],
+                                   upper=upper[busy])  # fmt: skip
+        turns = chain_pose(some, values[busy])[:3]
+        worlds = {j: Rotation.from_quat(rotations[busy, j], scalar_first=True)
+                  for j in (base.skeleton.parents[thigh], thigh, base.skeleton.parents[calf], calf,
+                            base.skeleton.parents[ankle], ankle) if j >= 0}  # fmt: skip
+        above = Rotation.identity(int(busy.sum()))
+        for joint, turn in zip(leg.joints, turns, strict=True):
+            # without a toe nothing says how the foot should turn: it keeps its way
+            turn = turn if len(joints) == 2 or joint != ankle else Rotation.identity(int(busy.sum()))
+            parent = base.skeleton.parents[joint]
+            quaternion = ((above * worlds[parent]).inv() * turn * worlds[joint]).as_quat(scalar_first=True)
+            quaternion *= np.where((quaternion * local[busy, joint]).sum(1, keepdims=True) < 0, -1.0, 1.0)
+            local[busy, joint] = quaternion
+            above = turn
+    return [np.linalg.norm(task(values)[0], axis=1) for task in tasks]

@@ -1,0 +1,269 @@
+"""Footskate removal with the legs: thesis 3.2. The hierarchy starts at the planted foot, the legs do the rest.
+
+Where the foot on the ground changes, the new one is put on the ground where it is, and from there on the hip follows
+from it (figure 3.7, algorithm of 3.2.1). The hip's path is that of the root method, low-passed; each foot is then
+brought exactly to where it stands by the analytic leg of appendix C, and between two plants the leg's correction
+passes over smoothly from one to the next.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import maximum_filter1d
+from scipy.spatial.transform import Rotation
+
+from motionfit._motion import Motion, bind_pose, host_kinematics
+from motionfit._skeleton import SIDES, Skeleton
+from motionfit.feet._detect import smooth
+from motionfit.feet._floor import Floor
+from motionfit.feet._plants import Footplants, runs
+from motionfit.feet._root import horizontal_path, root_steps
+from motionfit.feet._sole import Sole, sole_paths
+from motionfit.ik import move_limb
+
+CALM = 0.25  # [s] over which the root's correction is averaged, twice: the legs take the rest
+EASE = 0.12  # [s] within which a foot comes to rest and leaves again
+EVEN = 0.1  # [s] over which the height of a standing sole is averaged: its noise would go to the knee
+TREMOR = 0.06  # [s] over which the rotation of a standing foot is averaged
+EXACT = 1e-9  # [m] to which the vertices that stand are brought to their places
+STRETCH = 0.99  # of a leg's length: near the end the knee turns by degrees for a millimetre at the foot
+LOWEST = 0.1  # of a leg's length, as far as the character is lowered for the legs' sake
+
+
+class Leg(NamedTuple):
+    """Joints of one leg and, per frame, where they are in the world [m], with the knee's axis."""
+
+    joints: tuple[int, int, int]
+    hip: Float[np.ndarray, "frames 3"]
+    knee: Float[np.ndarray, "frames 3"]
+    ankle: Float[np.ndarray, "frames 3"]
+    lateral: Float[np.ndarray, "frames 3"]
+
+    @property
+    def length(self) -> Float[np.ndarray, " frames"]:
+        return np.linalg.norm(self.knee - self.hip, axis=1) + np.linalg.norm(self.ankle - self.knee, axis=1)
+
+
+def hip_from_foot(
+    motion: Motion, joint: int, place_world: Float[np.ndarray, "frames 3"], turn_world: Float[np.ndarray, "frames 4"]
+) -> tuple[Float[np.ndarray, "frames 3"], Float[np.ndarray, "frames 4"]]:
+    """Root position [m] and rotation for which a joint is where and turned as it should be: figure 3.7, the hierarchy
+    that starts at a foot. No joint is turned against its neighbour.
+
+    With the joint's own world rotation (`currentRotation` of the algorithm in 3.2.1) the root keeps its rotation,
+    and moves by as much as the foot has to.
+    """
+    positions, rotations = host_kinematics(motion)
+    root, foot = (Rotation.from_quat(rotations[:, j], scalar_first=True) for j in (0, joint))
+    turned = Rotation.from_quat(turn_world, scalar_first=True) * foot.inv()
+    place = place_world + turned.apply(positions[:, 0] - positions[:, joint])
+    return place, (turned * root).as_quat(scalar_first=True)
+
+
+def find_legs(skeleton: Skeleton, positions: np.ndarray, rotations: np.ndarray) -> list[Leg]:
+    """Both legs of a motion whose world kinematics are given. The knee's axis is the one about which the shank bends
+    over the clip, fixed in the thigh; a leg that never bends takes the character's left-right axis at bind."""
+    legs = []
+    for side in SIDES:
+        joints = skeleton.joint(f"{side}_thigh"), skeleton.joint(f"{side}_calf"), skeleton.joint(f"{side}_foot")
+        hip, knee, ankle = (positions[:, j] for j in joints)
+        turn = Rotation.from_quat(rotations[:, joints[0]], scalar_first=True)
+        bend = turn.inv().apply(np.cross(knee - hip, ankle - knee)).sum(0)
+        if np.linalg.norm(bend) < 0.02 * np.sum(
+            np.linalg.norm(knee - hip, axis=1) * np.linalg.norm(ankle - knee, axis=1)
+        ):
+            bind = Rotation.from_quat(bind_pose(skeleton)[1][joints[0]], scalar_first=True)
+            bend = bind.inv().apply([1.0, 0.0, 0.0])
+        legs.append(Leg(joints, hip, knee, ankle, turn.apply(bend / np.linalg.norm(bend))))
+    return legs
+
+
+def hold_feet(
+    paths: Float[np.ndarray, "frames soles 3"],
+    rows: Int[np.ndarray, "frames 2"],
+    speed: Float[np.ndarray, "frames soles"],
+    sole: Sole,
+    floor: Floor,
+    dt: float,
+) -> Float[np.ndarray, "frames 2 3"]:
+    """How far [m] each foot must move in each frame so that it stands still, on the floor, while it is planted.
+
+    In a plant the vertex stood on keeps its horizontal place (chosen so that the foot moves as little as possible on
+    the whole) and the foot's lowest vertex, its height averaged over a moment, is on the floor. Between two plants the move goes over from one to the
+    other, with the speeds that the foot needs to come to rest, and a swinging sole does not go under the floor.
+    """
+    frames, even = len(paths), 2 * round(EVEN / dt / 2) + 1
+    moves = np.zeros((frames, 2, 3))
+    for foot in (0, 1):
+        mine = sole.of(foot)
+        heights = floor.above(paths[:, mine])
+        lowest = heights.min(1)
+        steps = root_steps(paths, rows[:, foot], speed, sole.side)[0]
+        move = moves[:, foot]
+        plants = runs(rows[:, foot] >= 0)
+        for start, end in plants:
+            held = np.concatenate([np.zeros((1, 3)), np.cumsum(steps[start:end], axis=0)])
+            held -= held.mean(0)
+            held[:, 1] = floor.at(held) - floor.height - smooth(lowest[start : end + 1], even)
+            move[start : end + 1] = held
+        if plants:
+            _pass_over(move, plants, dt)
+            air = rows[:, foot] < 0
+            move[air, 1] = np.maximum(move[air, 1], -lowest[air])
+    return moves
+
+
+def _pass_over(move: Float[np.ndarray, "frames 3"], plants: list[tuple[int, int]], dt: float) -> None:
+    """Fill the frames between plants, in place: the smooth step 3s^2 - 2s^3 from one end to the other, plus what
+    meets the speeds at both ends (the cubic Hermite polynomials of a slope) within the ease."""
+    move[: plants[0][0]] = move[plants[0][0]]
+    move[plants[-1][1] + 1 :] = move[plants[-1][1]]
+    reach = max(1, round(EASE / dt))
+    for (start, end), (after, last) in zip(plants, plants[1:], strict=False):
+        gap = after - end
+        if gap < 2:
+            continue
+        s = np.arange(1, gap)[:, None] / gap
+        filled = move[end] + (3 * s**2 - 2 * s**3) * (move[after] - move[end])
+        width = min(reach, gap)
+        for edge, inner, sign in ((end, max(end - 2, start), 1), (after, min(after + 2, last), -1)):
+            if inner == edge:
+                continue
+            slope = (move[edge] - move[inner]) / (edge - inner)  # per frame
+            at = np.clip(sign * (np.arange(end + 1, after)[:, None] - edge) / width, 0.0, 1.0)
+            filled = filled + sign * width * slope * (at**3 - 2 * at**2 + at)
+        move[end + 1 : after] = filled
+
+
+def lowering(legs: list[Leg], targets: list[Float[np.ndarray, "frames 3"]], dt: float) -> Float[np.ndarray, " frames"]:
+    """How far [m] the character must come down so that both legs reach, as a smooth curve over what each frame asks
+    for: the largest demand within the ease, averaged twice (thesis 5.5.1 lowers by one small amount)."""
+    needed = np.zeros(len(legs[0].hip))
+    for leg, target in zip(legs, targets, strict=True):
+        gap, reach = leg.hip - target, STRETCH * leg.length
+        up = np.sqrt(np.maximum(reach**2 - gap[:, 0] ** 2 - gap[:, 2] ** 2, 0.0))
+        needed = np.maximum(needed, np.minimum(gap[:, 1] - up, LOWEST * leg.length))
+    if not needed.any():
+        return needed
+    width = 2 * max(1, round(EASE / dt)) + 1
+    # the mean of a maximum over twice the width never falls below the demand
+    return smooth(smooth(maximum_filter1d(needed, 2 * width - 1, mode="nearest"), width), width)
+
+
+def turn_legs(
+    motion: Motion, legs: list[Leg], targets: list[Float[np.ndarray, "frames 3"]], rotations: np.ndarray
+) -> tuple[Float[np.ndarray, "frames joints 4"], Bool[np.ndarray, "frames 2"]]:
+    """Joint rotations with each ankle at its target and the feet's world rotations kept; which targets were reached."""
+    skeleton, local = motion.skeleton, np.array(motion.rotations, float)
+    reachable = np.ones((motion.frame_count, 2), bool)
+
+    def world(joint: int) -> Rotation:
+        return Rotation.from_quat(rotations[:, joint], scalar_first=True)
+
+    for side, (leg, target) in enumerate(zip(legs, targets, strict=True)):
+        found = move_limb(leg.hip, leg.knee, leg.ankle, target, leg.lateral)
+        reachable[:, side] = found.reachable
+        moved = np.linalg.norm(target - leg.ankle, axis=1) > 0
+        thigh, calf, foot = leg.joints
+        # joints between (twist bones) turn with the one above them
+        new = {
+            thigh: world(skeleton.parents[thigh]).inv() * found.upper * world(thigh),
+            calf: (found.upper * world(skeleton.parents[calf])).inv() * found.lower * world(calf),
+            foot: (found.lower * world(skeleton.parents[foot])).inv() * world(foot),
+        }
+        for joint, turned in new.items():
+            quaternion = turned.as_quat(scalar_first=True)
+            # the same side of the double cover as before: no sign jumps in files
+            quaternion *= np.where((quaternion * local[:, joint]).sum(1, keepdims=True) < 0, -1.0, 1.0)
+            local[moved, joint] = quaternion[moved]
+    return local, reachable
+
+
+def calm_feet(motion: Motion, rows: Int[np.ndarray, "frames 2"]) -> Motion:
+    """The motion with the tremor of its planted feet averaged away.
+
+    A foot that stands does not tremble; in a capture it does, by a degree or so. Held at the toes, it would hand
+    that on to the knee. Over `TREMOR` the foot's world rotation and the toes' local one are averaged, less and less
+    towards both ends of a plant, so that they join what is before and after.
+    """
+    skeleton, dt = motion.skeleton, float(motion.dt)
+    local, width = np.array(motion.rotations, float), 2 * round(TREMOR / dt / 2) + 1
+    world = host_kinematics(motion)[1]
+    for foot, side in enumerate(SIDES):
+        ankle, toe = skeleton.joint(f"{side}_foot"), skeleton.find(f"{side}_toe")
+        turned = world[:, ankle].copy()
+        for start, end in runs(rows[:, foot] >= 0):
+            part = slice(start, end + 1)
+            turned[part] = _mean_rotation(turned[part], width)
+            if toe is not None:
+                local[part, toe] = _mean_rotation(local[part, toe], width)
+        above = Rotation.from_quat(world[:, skeleton.parents[ankle]], scalar_first=True)
+        new = (above.inv() * Rotation.from_quat(turned, scalar_first=True)).as_quat(scalar_first=True)
+        new *= np.where((new * local[:, ankle]).sum(1, keepdims=True) < 0, -1.0, 1.0)
+        planted = rows[:, foot] >= 0
+        local[planted, ankle] = new[planted]
+    return Motion(skeleton, motion.root, local, motion.dt, motion.translations)
+
+
+def _mean_rotation(q: Float[np.ndarray, "frames 4"], width: int) -> Float[np.ndarray, "frames 4"]:
+    """Running mean of unit quaternions that lie close together."""
+    flips = np.cumprod(np.append(1.0, np.where((q[1:] * q[:-1]).sum(1) < 0, -1.0, 1.0)))[:, None]
+    mean = smooth(q * flips, width)
+    return mean / np.linalg.norm(mean, axis=1, keepdims=True) * flips
+
+
+def with_leg_ik(
+    base: Motion,
+    sole: Sole,
+    plants: Footplants,
+    paths: Float[np.ndarray, "frames soles 3"],
+    rows: Int[np.ndarray, "frames 2"],
+    speed: Float[np.ndarray, "frames soles"],
+    target: Floor | None,
+    lift: float | None,
+) -> tuple[Motion, Bool[np.ndarray, "frames 2"], dict[str, float]]:
+    """The motion with planted feet exactly in place, which legs reached, and by how much it was lowered [m].
+
+    The vertices stood on hold their places to `EXACT`; the feet keep their orientation, less its tremor.
+    """
+    base = calm_feet(base, rows)
+    paths = sole_paths(sole, base)
+    dt, root = float(base.dt), np.asarray(base.root, float)
+    frames = np.arange(base.frame_count)
+    carrier = np.where(plants.primary >= 0, rows[frames, np.maximum(plants.primary, 0)], -1)
+    floor = plants.floor if target is None else target
+    correction = horizontal_path(root, paths - root[:, None], carrier, speed, sole.side, dt) - root
+    calm = 2 * round(CALM / dt / 2) + 1
+    correction = smooth(smooth(correction, calm), calm)
+    moved = root + correction
+    if target is not None:
+        held = carrier >= 0
+        rise = -plants.floor.above(paths[frames, carrier])[held].mean() if held.any() else 0.0
+        moved[:, 1] = floor.at(moved) + plants.floor.above(root) + rise
+    else:
+        moved[:, 1] = floor.at(moved) + plants.floor.above(root)
+    shift = moved - root
+    positions, rotations = host_kinematics(base)
+    moves = hold_feet(paths + shift[:, None], rows, speed, sole, floor, dt)
+    legs = find_legs(base.skeleton, positions + shift[:, None], rotations)
+    targets = [leg.ankle + moves[:, side] for side, leg in enumerate(legs)]
+    down = lowering(legs, targets, dt) if lift is None else np.full(base.frame_count, float(lift))
+    below = np.array([0.0, 1.0, 0.0]) * down[:, None]
+    legs = [leg._replace(hip=leg.hip - below, knee=leg.knee - below, ankle=leg.ankle - below) for leg in legs]
+    wanted = paths + (shift[:, None] + moves[:, sole.side])
+    standing = rows >= 0
+    dtype = np.asarray(base.root).dtype
+    for _ in range(4):
+        local, reachable = turn_legs(base, legs, targets, rotations)
+        result = Motion(base.skeleton, moved - below, local, base.dt, base.translations)
+        # a sole vertex that hangs on the shank's skin too is not yet quite where it should be: once more
+        missing = np.take_along_axis(wanted - sole_paths(sole, result), np.maximum(rows, 0)[..., None], axis=1)
+        missing = np.where((standing & reachable)[..., None], missing, 0.0)
+        if np.abs(missing).max() < EXACT:
+            break
+        targets = [target + missing[:, side] for side, target in enumerate(targets)]
+    reachable |= ~standing
+    result = Motion(base.skeleton, result.root.astype(dtype), local.astype(np.asarray(base.rotations).dtype), base.dt,
+                    base.translations)  # fmt: skip
+    return result, reachable, {"lowered_max_m": float(down.max())}
