@@ -246,7 +246,7 @@ def _reach_errors(work: Work, reaches: tuple[int, ...], solver: Banded) -> tuple
     points = start[0].shape[0]
     count = len(start)
     # pseudo-random, so that no cancellation hides a row that reaches too far
-    probe = tuple(jnp.sin(12.9898 * (k + 1) + 78.233 * jnp.arange(points) ** 1.5) for k in range(count))
+    probe = tuple(jnp.sin(12.9898 * (k + 1) + 78.233 * jnp.arange(points, dtype=float) ** 1.5) for k in range(count))
     probe = tuple(p.astype(s.dtype) for p, s in zip(probe, start, strict=True))
     errors = []
     for k in range(len(objective.terms)):
@@ -261,7 +261,7 @@ def _reach_errors(work: Work, reaches: tuple[int, ...], solver: Banded) -> tuple
         windows = solver.windows(columns.reshape(*columns.shape[:2], -1), count)
         # the rows that the windows allow, times the probe, against the product itself
         stacked = jnp.stack(probe, axis=1)
-        place = jnp.minimum(jnp.arange(points)[:, None] + jnp.arange(solver.width), points - 1)
+        place = np.minimum(np.arange(points)[:, None] + np.arange(solver.width), points - 1)
         seen = stacked[place].reshape(points, -1)
         allowed = jnp.einsum("kin,ki->kn", windows, seen).reshape(points, solver.frames_of.shape[1], -1)
         exact = product(probe).reshape(value.shape[0], -1)

@@ -99,11 +99,11 @@ class Banded(lx.AbstractLinearSolver):
         tree = jax.tree.unflatten(jax.tree.structure(unknowns), [seeds[:, c] for c in range(controls)])
         return jax.tree.leaves(jax.vmap(operator.mv)(tree))
 
-    def windows(self, rows: Float[Array, "colours frames n"], controls: int) -> Float[Array, "points window n"]:
+    def windows(self, rows: Float[Array, "colours frames n"], controls: int) -> Float[Array, "points window rows"]:
         """Jacobian rows by the control point that their window starts at: (points, width * controls, rows * n)."""
         width, frames = self.width, rows.shape[1]
         rows = rows.reshape(controls, width, frames, -1)
-        place = (jnp.asarray(self.first)[None] + jnp.arange(width)[:, None]) % width
+        place = (jnp.asarray(self.first)[None] + np.arange(width, dtype=np.int32)[:, None]) % width
         rows = jnp.take_along_axis(rows, place[None, :, :, None], axis=1)
         rows = jnp.pad(rows, ((0, 0), (0, 0), (0, 1), (0, 0)))  # the row that fills up short windows
         grouped = rows[:, :, jnp.asarray(self.frames_of)]  # (controls, width, points, frames of a window, n)
@@ -139,9 +139,9 @@ class Banded(lx.AbstractLinearSolver):
         rows = jnp.stack(leaves, axis=-1).reshape(controls, period, points, controls)
         band = []
         for i in range(self.width):
-            colour = (jnp.arange(points) + i) % period
-            block = jnp.take_along_axis(rows, colour[None, None, :, None], axis=1)[:, 0]  # (column c, point, row c)
-            exists = (jnp.arange(points) + i < points)[:, None, None]
+            colour = (np.arange(points) + i) % period
+            block = jnp.take_along_axis(rows, jnp.asarray(colour)[None, None, :, None], axis=1)[:, 0]  # (column c, point, row c)
+            exists = (np.arange(points) + i < points)[:, None, None]
             band.append(jnp.where(exists, jnp.transpose(block, (1, 2, 0)), 0.0))
         return jnp.stack(band, axis=1)
 

@@ -261,13 +261,12 @@ class _CompileClock:
 def _measure_all(body, motions: dict, source, clip, reference, progress) -> dict[str, dict]:
     """An M of report.json per motion; `_excess` holds the excess depths on the volumes for the picture."""
     import motionfit as mf
-    from motionfit.adapt import build_clearance, volume_depths
-    from motionfit.adapt._pipeline import reference_depths
+    from motionfit.adapt import build_clearance, reference_depths, volume_depths
     from motionfit.metrics import measure, skin_depths
 
     pairs = mf.shape.PAIRS
     clearance = build_clearance(body, pairs)
-    limit = reference_depths(clip, body, reference, pairs, "vertex", clearance)
+    limit, _ = reference_depths(clip, body, reference, pairs)
     # about 30 looks per second at the skin: what a limb does between two of them is under a millimetre deep
     some = next(iter(motions.values()))
     step = max(1, round(some.frame_rate / 30))

@@ -31,8 +31,9 @@ def test_bind_pose_leaves_every_bind_point_where_it_is(arguments):
     motion = random_motion(*arguments)
     kin = mf.forward_kinematics(motion.skeleton, rest_motion(motion.skeleton))
     joints = len(motion.skeleton.names)
-    np.testing.assert_allclose(kin.skin_rotations[0], np.tile(np.eye(3), (joints, 1, 1)), atol=EXACT)
-    np.testing.assert_allclose(kin.skin_translations[0], np.zeros((joints, 3)), atol=EXACT)
+    turns, shifts = kin.skin_transforms()
+    np.testing.assert_allclose(turns[0], np.tile(np.eye(3), (joints, 1, 1)), atol=EXACT)
+    np.testing.assert_allclose(shifts[0], np.zeros((joints, 3)), atol=EXACT)
 
 
 def test_translations_replace_the_offsets():

@@ -1,17 +1,23 @@
 """Volumes against closed forms, distances against dense sampling, girth growth."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 import motionfit as mf
+from motionfit import samples
 from motionfit._motion import bind_pose
 from motionfit.shape import grow, parse_girth
 from motionfit.shape.distance import capsule_depth, closest_on_lines, cylinder_depth, segment_distance
-from motionfit.shape.volumes import fit_section, fit_volumes
+from motionfit.shape.field import fit_field, inside_depths, make_probes, part_surface, standing, standing_vertices
+from motionfit.shape.volumes import fit_volumes
+from tests.helpers import central_difference
 
 
 @given(st.integers(0, 2**31), st.booleans())
@@ -71,15 +77,61 @@ def test_a_cylinder_is_found_as_one():
     assert np.linalg.norm(capsule.end[k] - capsule.start[k]) == pytest.approx(0.5 - 0.12, rel=0.02)
 
 
-def test_a_section_fits_the_skin_of_real_shapes(heavy):
-    for part, bound in (("torso", 0.012), ("left_thigh", 0.006), ("left_forearm", 0.004)):
-        section = fit_section(heavy, part)
-        mine = heavy.part_of_vertex == mf._character.PARTS.index(part)
-        depth = np.asarray(section.depth_bind(jnp.asarray(heavy.skin.vertices_bind[mine])))
-        assert np.sqrt(np.mean(depth**2)) < bound, part
-        outward = np.asarray(heavy.skin.normals_bind)[mine] * 0.03
-        outside = np.asarray(section.depth_bind(jnp.asarray(heavy.skin.vertices_bind[mine] + outward)))
-        assert np.mean(outside < 0) > 0.97, part
+def test_a_field_tells_the_depth_below_the_skin(heavy):
+    """Against exact distances to the part's own surface in the tabulated pose, at random points in and around it."""
+    posed = standing_vertices(heavy)
+    still = standing(heavy.skeleton)
+    kin = mf.forward_kinematics(heavy.skeleton, still)
+    rng = np.random.default_rng(0)
+    for part in ("torso", "left_thigh", "right_calf"):
+        field, surface = fit_field(heavy, part), part_surface(heavy, part)
+        vertices = posed[surface.used]
+        corners = vertices[surface.triangles[rng.integers(0, len(surface.triangles), 400)]].mean(axis=1)
+        points = corners + rng.normal(size=(400, 3)) * 0.02
+        exact = inside_depths(points, vertices, surface.triangles)
+        told = np.asarray(field.depth(kin, jnp.asarray(points.T)[:, None]))[0]
+        inside = exact > 0.004
+        assert np.median(np.abs(told[inside] - exact[inside])) < 0.0015, part
+        assert np.mean(told[exact == 0] < 0.004) > 0.95, part
+
+
+def test_a_field_moves_with_its_part(heavy, rng):
+    """Turning and moving the whole body moves the depths along: they are the same at the moved points."""
+    field, still = fit_field(heavy, "torso"), standing(heavy.skeleton)
+    points = standing_vertices(heavy)[rng.integers(0, len(heavy.skin.vertices_bind), 50)]
+    turn, shift = Rotation.from_euler("yx", [70, 20], degrees=True), np.array([0.5, 0.2, -1.0])
+    rotations = np.array(still.rotations)
+    rotations[0, 0] = (turn * Rotation.from_quat(rotations[0, 0], scalar_first=True)).as_quat(scalar_first=True)
+    moved = mf.Motion(heavy.skeleton, turn.apply(np.asarray(still.root)) + shift, rotations, still.dt)
+    depths = [
+        field.depth(mf.forward_kinematics(heavy.skeleton, m), jnp.asarray(p.T)[:, None])
+        for m, p in ((still, points), (moved, turn.apply(points) + shift))
+    ]
+    np.testing.assert_allclose(*depths, atol=1e-9)
+
+
+def test_lookups_have_the_gradient_that_differences_show(heavy, rng):
+    field = fit_field(heavy, "left_thigh")
+    size = np.array(field.coefficients.shape)
+    points = np.asarray(field.origin) + rng.uniform(0.5, size - 1.5, size=(40, 3)) * np.asarray(field.spacing)
+
+    def total(x):
+        return jnp.sum(jnp.sin(50 * field.depth_home(list(x.T))))
+
+    gradient = jax.grad(total)(jnp.asarray(points))
+    np.testing.assert_allclose(gradient, central_difference(jax.jit(total), points), atol=1e-5)
+    tables = jnp.asarray(field.coefficients)
+    along = jax.jvp(lambda c: eqx.tree_at(lambda f: f.coefficients, field, c).depth_home(list(points.T)), (tables,), (tables,))
+    np.testing.assert_allclose(*along, atol=1e-12)  # linear in the table, inside the grid
+
+
+def test_probes_are_skinned_vertices(heavy):
+    walk = mf.onto(samples.walk(cycles=1), heavy.skeleton)[::20]
+    mine = np.flatnonzero(heavy.part_of_vertex == mf._character.PARTS.index("left_upper_arm"))[::7]
+    kin = mf.forward_kinematics(heavy.skeleton, walk)
+    exact = mf.skin(heavy.skin, kin)[0][:, mine]
+    told = jnp.moveaxis(make_probes(heavy, "left_upper_arm", mine).positions_world(kin), 0, -1)
+    assert np.linalg.norm(told - exact, axis=-1).max() < 2e-3  # weights of joints far away are left out
 
 
 def test_girth_of_one_changes_no_bit(average):

@@ -9,6 +9,7 @@ import motionfit as mf
 from motionfit import samples
 from motionfit._motion import rest_motion
 from motionfit.adapt import build_clearance
+from motionfit.adapt._clearance import _row_depths
 from motionfit.shape.pairs import pairs_of
 from motionfit.splines import bspline_basis
 from motionfit.terms.penetration import hinge
@@ -27,14 +28,21 @@ def _problem(term, character, motion, joints=("left_upper_arm", "right_thigh", "
     return mf.Problem(character, motion, {"term": term}, controls)
 
 
+def signed_depths(clearance, kin):
+    """Depth [m] per frame and pair, negative for a gap."""
+    rows = np.asarray(_row_depths(clearance.term, kin, None))
+    owner = np.array(clearance.pair_of_row)
+    return np.stack([rows[:, owner == k].max(axis=1) for k in range(len(clearance.pairs))], axis=1)
+
+
 def _terms(character, motion):
     kin = mf.forward_kinematics(character.skeleton, motion)
     frames = motion.frame_count
     for objective in ("vertex", "capsule", "joint"):
         for block in ("arms", "legs"):
             clearance = build_clearance(character, pairs_of(block), objective)
-            # within a hair of first contact: half of the rows just touch, half just do not
-            depth = np.asarray(clearance.row_depths(kin))
+            # within a hair of first contact: half of the pairs just touch, half just do not
+            depth = signed_depths(clearance, kin)
             touching = depth - 1e-4 * np.where(np.arange(depth.shape[1]) % 2 == 0, 1.0, -1.0)
             yield f"{objective}-{block}-contact", clearance.allowing(touching)
             yield f"{objective}-{block}-deep", clearance.allowing(np.full_like(depth, -0.05))

@@ -4,9 +4,10 @@ import sys
 import types
 
 from motionfit.adapt._clearance import OBJECTIVES, build_clearance, volume_depths
+from motionfit.adapt._limits import reference_depths
 from motionfit.adapt._pipeline import BLOCKS, adapt, arms, legs
 
-__all__ = ["BLOCKS", "OBJECTIVES", "adapt", "arms", "build_clearance", "legs", "volume_depths"]
+__all__ = ["BLOCKS", "OBJECTIVES", "adapt", "arms", "build_clearance", "legs", "reference_depths", "volume_depths"]
 
 
 class _CallableModule(types.ModuleType):

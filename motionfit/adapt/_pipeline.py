@@ -5,56 +5,65 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy.ndimage import gaussian_filter1d, maximum_filter1d
+from jaxtyping import Float, Int
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
 
 from motionfit._character import Character
 from motionfit._control import Control, Correction
-from motionfit._fit import Block, BlockReport, Fit, fit
-from motionfit._motion import Motion, bucket, host_kinematics, rest_motion
+from motionfit._fit import Block, Fit, fit
+from motionfit._motion import Motion, bucket, host_kinematics
 from motionfit._onto import onto
 from motionfit._problem import During, Problem, Term
+from motionfit._skeleton import SIDES
 from motionfit._types import InputError
 from motionfit.adapt._clearance import Clearance, allowance, build_clearance, reduced, support, volume_depths
 from motionfit.adapt._controls import arm_controls, leg_controls
-from motionfit.metrics import TOLERANCE, derivative_ratio, skin_depths
-from motionfit.shape.field import standing
+from motionfit.adapt._limits import ENOUGH, SkinLooks, reference_depths
+from motionfit.metrics import TOLERANCE, derivative_ratio
 from motionfit.shape.growth import grow
-from motionfit.shape.pairs import PAIRS, Pair, pairs_of
+from motionfit.shape.pairs import Pair, pairs_of
 from motionfit.splines import Basis, bspline_basis
 from motionfit.terms.pose import Effort, Smoothness
 
 BLOCKS = ("arms", "legs")
 
-SOLVE_RATE = 60.0  # [1/s] frames that the solver looks at; between two of them a limb's depth changes by millimetres
+SOLVE_RATE = 60.0  # [1/s] of the frames that the solver sees: between two of them a limb's depth changes by millimetres
 KNOT_SPACING = 0.1  # [s]
 SOLVE_PROBES = {"upper_arm": 20, "forearm": 16, "hand": 12, "thigh": 20, "calf": 20}  # per pair, of those looked at
-ALLOWED_EXCESS = 0.005  # [m]
+ALLOWED_EXCESS = 0.005  # [m] that may stay where more was; well under TOLERANCE, which the skin is judged by
 MARGIN = 0.001  # [m]
-SIGMA_DEPTH = 0.01  # [m]
+LEAST_GAP = 0.005  # [m]
+# Across and twist are there for what r alone cannot do, and the skin around a shoulder is known least where it twists
 SIGMA_EFFORT = {
-    "left_arm": 1.0, "left_arm_across": 1.0, "left_arm_twist": 0.4,
-    "right_arm": 1.0, "right_arm_across": 1.0, "right_arm_twist": 0.4,
-    "hip_turn": 0.1, "thighs_apart": 1.0,
-}  # [rad]  # fmt: skip
+    **{f"{side}_arm{kind}": sigma for side in SIDES for kind, sigma in (("", 1.0), ("_across", 1.0), ("_twist", 0.4))},
+    "hip_turn": 0.1,
+    "thighs_apart": 1.0,
+}  # [rad]
 JERK_SHARE = 1.0  # of the hands' own jerk, what the correction may add at the cost of 1 per frame
 LEVER = 0.5  # [m] shoulder to hand
 LEAST_JERK = 30.0  # [m/s^3] for clips that stand still
-LOOKS = 6
-MOST_JERK = 1.04
-SHOULDER_SLACK = 1.15
-LEAST_LOOKS, LOOK_SHARE = 10, 1 / 60  # of the frames that the solver sees, looked at on the skin
+MOST_JERK = 1.04  # ratio to the source's
+ROUNDS = 6
 
 
 class Stage(NamedTuple):
-    """A block of the solve: its clearance on all probes and on the ones it works with, and the depths [m] that may
-    stay, per frame and pair."""
+    """A block of the solve: its clearance on all probes, the `columns` of its pairs, and the depths [m] that may stay,
+    per frame and pair."""
 
     block: Block
-    recipe: str
     clearance: Clearance
-    allowed: Float[np.ndarray, "frames pairs"]
     columns: list[int]
+    allowed: Float[np.ndarray, "frames pairs"]
+
+
+class Seen(NamedTuple):
+    """The clip as the solver sees it: some of its frames, repeated at the end up to a bucket's length."""
+
+    frames: Int[np.ndarray, " seen"]  # of the clip
+    motion: Motion
+    padded: Motion
+    basis: Basis
+    controls: tuple[Control, ...]
 
 
 def adapt(
@@ -68,91 +77,115 @@ def adapt(
     sweeps: int = 1,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Fit:
+    """Adapt a clip to the shape of a character.
+
+    The clip is put on the character (`motionfit.onto`), then the blocks run in turn, `sweeps` times: `arms` keeps
+    upper arms, forearms and hands out of the trunk and the thighs, the left arm first, `legs` the thighs and calves
+    apart. Penetration counts as far as it exceeds what the same clip shows on `reference`, the body that it was made
+    for; without one, on the character before `girth`, else in its rest pose.
+
+    The solver sees 60 frames per second, and the skin's probes that matter. Afterwards all probes are looked at, with
+    a reference also the skinned mesh itself at some frames, and the jerk; where more than the tolerance is left the
+    volumes get less room, where the jerk grew the correction gets smoother, and the blocks run again from where they
+    were.
+
+    The `Fit` holds the adapted motion, the correction, what each block did, and per pair and seen frame
+    (`fit.details["frames"]`) the excess depth [m] on the volumes before and after
+    (`fit.details["excess_before_m"]`, `["excess_after_m"]`).
+    """
     unknown = [b for b in blocks if b not in BLOCKS]
     if unknown or not blocks:
         raise InputError(f"unknown block {', '.join(map(repr, unknown)) or 'list'}; blocks: {', '.join(BLOCKS)}")
     if girth:
         reference, character = reference or character, grow(character, girth)
     base = onto(clip, character.skeleton)
-    frames = _solve_frames(base)
-    small = dataclasses.replace(base[frames], dt=np.asarray(base.dt) * (frames[1] - frames[0] if len(frames) > 1 else 1))
-    length = bucket(len(frames))
-    rows = frames[np.minimum(np.arange(length), len(frames) - 1)]  # of the clip, for each padded frame
-    basis = bspline_basis(length, float(small.dt), KNOT_SPACING)
+    controls, whole, seen = _controls(character, base, blocks)
     everything = build_clearance(character, pairs_of(*blocks), objective)
-    pairs = everything.pairs
-    own, at_ease = _limits(clip, frames, character, reference, pairs, objective)
+    pairs, small = everything.pairs, seen.motion
+
+    own, joint_own = reference_depths(clip[seen.frames], character, reference, pairs, objective)
     before = volume_depths(everything, small)
     excess = before - own
-    # A pair that shows no violation is left alone. What the reference shows standing with its arms hanging is the
-    # joint's own overlap, at the armpit above all: measured against the reference frame by frame it would count as
-    # excess wherever a clip holds the arms out, as every adapted clip does, and each further adaptation would push
-    # them further out.
-    quiet = (before - np.maximum(own, at_ease)).max(axis=0) <= TOLERANCE
-    skin = None if reference is None or objective != "vertex" else _Skin(clip, frames, character, reference, pairs)
-    beyond = np.zeros_like(own)
-    if skin is not None:
-        seen = skin.depths(small)
-        # near the shoulder the skin knows better than the fields
-        slack = np.array([2.0 if p.first.endswith("upper_arm") else 1.0 for p in pairs])
-        quiet = skin.quiet(seen) & ((before - np.maximum(own, at_ease)).max(axis=0) <= slack * TOLERANCE)
-        beyond = np.where(quiet, 0.0, skin.beyond(seen, excess))
+    # a pair that shows no violation is left alone; near the shoulder the skin knows better than the fields
+    slack = np.where([p.first.endswith("upper_arm") for p in pairs], 2.0, 1.0)
+    looks, beyond = None, np.zeros_like(own)
+    if reference is None or objective != "vertex":
+        quiet = (before - np.maximum(own, joint_own)).max(axis=0) <= TOLERANCE
+    else:
+        looks = SkinLooks(clip[seen.frames], character, reference, pairs)
+        on_skin = looks.depths(small)
+        quiet = (before - np.maximum(own, joint_own)).max(axis=0) <= slack * TOLERANCE
+        quiet &= looks.quiet(on_skin)
+        beyond = np.where(quiet, 0.0, looks.beyond(on_skin, excess, ALLOWED_EXCESS))
     kept = own + allowance(excess + beyond, ALLOWED_EXCESS, MARGIN)
-    # parts that do not meet at a joint may touch as on the reference, but on an adapted clip the reference no longer
-    # does: what is kept must pass for no violation then either
-    kept = np.where([p.adjacent for p in pairs], kept, np.maximum(own, np.minimum(kept, 0.8 * TOLERANCE)))
+    # parts that do not meet at a joint touch less on the reference once the clip is adapted: what is kept must pass
+    # for no violation then either, and is still a touch
+    kept = np.where([p.adjacent for p in pairs], kept, np.minimum(kept, ENOUGH * TOLERANCE))
     allowed = np.where(quiet, np.maximum(before, own), kept)
 
-    whole = bspline_basis(base.frame_count, float(base.dt), _spacing(basis, small, base))
-    controls: list[Control] = []
-    if "arms" in blocks:
-        controls += arm_controls(character, base, whole)
-    if "legs" in blocks:
-        controls += leg_controls(character, base, whole)
-    reduced_controls = tuple(_at(c, rows, basis) for c in controls)
-    stages = []
-    for recipe in blocks:
-        for block, mine in _blocks_of(recipe, pairs):
-            clearance = build_clearance(character, mine, objective)
-            columns = [pairs.index(p) for p in clearance.pairs]
-            stages.append(Stage(block, recipe, clearance, allowed[:, columns], columns))
-
-    correction, history, result = Correction.zero(reduced_controls), [], None
-    smooth = _jerk_scale(base)
-    total = LOOKS * len(stages)
-    padded = dataclasses.replace(base[rows], dt=small.dt)
-    for look in range(LOOKS):
-        problem = _problem(character, padded, small, stages, beyond, reduced_controls, smooth, objective, result and result.motion[np.arange(len(frames))])
+    stages = _stages(character, blocks, pairs, objective, allowed)
+    smooth, history, correction, moved = _jerk_scale(base), [], Correction.zero(seen.controls), small
+    for round_ in range(ROUNDS):
+        problem = _problem(character, seen, stages, beyond, smooth, (small, moved))
         result = fit(problem, [s.block for s in stages], sweeps, correction=correction, progress=None if progress is None
-                     else lambda name, done, _, look=look: progress(name, look * len(stages) + done, total))  # fmt: skip
-        correction, history = result.correction, history + list(result.history)
-        moved = result.motion[np.arange(len(frames))]
+                     else lambda name, done, _, k=round_: progress(name, k * len(stages) + done, ROUNDS * len(stages)))  # fmt: skip
+        correction, history = result.correction, [*history, *result.history]
+        moved = result.motion[np.arange(small.frame_count)]
+        used = allowed if not round_ else np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
+        used = used - beyond
         after = volume_depths(everything, moved)
-        used = {s.block.name: s.allowed - beyond[:, s.columns] for s in stages}
-        over = after - own
-        if skin is not None:
-            beyond = np.where(quiet, 0.0, skin.beyond(skin.depths(moved), over))
-        over = np.where(quiet, 0.0, over + beyond)
-        if look == LOOKS - 1:
-            break
+        over = np.where(quiet, 0.0, after - own)
+        if looks is not None:
+            on_skin = looks.depths(moved)
+            beyond = np.where(quiet, 0.0, looks.beyond(on_skin, after - own, ALLOWED_EXCESS, beyond))
+            over[looks.at] = np.where(quiet, 0.0, np.maximum(over[looks.at], on_skin - looks.own))
+        clean = over.max(initial=0.0) <= ENOUGH * TOLERANCE
         jerk = derivative_ratio(_final(controls, whole, correction).apply(base), base, 3) or 1.0
+        if (clean and jerk <= MOST_JERK) or round_ == ROUNDS - 1:
+            break
         if jerk > MOST_JERK:
             smooth *= 0.5
-        elif over.max(initial=0.0) <= TOLERANCE * 0.8:
-            break
-        if over.max(initial=0.0) <= TOLERANCE * 0.8:
-            continue
-        # the solver looks at some points only, and its corrections are smooth: what is still seen is taken off
-        stages = [
-            _tighten(s, np.where(over > 0.7 * TOLERANCE, after, 0.0)[:, s.columns] - used[s.block.name], float(small.dt))
-            for s in stages
-        ]
+        if not clean:
+            # the solver sees some probes only, and its corrections are smooth: what they left is taken off
+            left = np.where(over > 0.7 * TOLERANCE, after - used, 0.0)
+            stages = [_tighten(s, left[:, s.columns], float(small.dt)) for s in stages]
     final = _final(controls, whole, correction)
-    motion = final.apply(base)
     status = "violations_left" if over.max(initial=0.0) > TOLERANCE else "converged"
-    details = {"pairs": [p.name for p in pairs], "frames": frames, "excess_before_m": before - own,
+    details = {"pairs": [p.name for p in pairs], "frames": seen.frames, "excess_before_m": excess,
                "excess_after_m": after - own}  # fmt: skip
-    return Fit(final, motion, base, status, tuple(history), result.problem, details)
+    return Fit(final, final.apply(base), base, status, tuple(history), result.problem, details)
+
+
+def _order(stages: list[Stage]) -> Int[np.ndarray, " pairs"]:
+    """Where each pair stands among the stages' columns."""
+    return np.argsort(np.concatenate([s.columns for s in stages]))
+
+
+def _controls(character: Character, base: Motion, blocks: Sequence[str]) -> tuple[tuple[Control, ...], Basis, Seen]:
+    """The controls of the whole clip, their basis, and the clip as the solver sees it.
+
+    Knots lie on the same instants in both, so the control points are the same.
+    """
+    step = max(1, round(base.frame_rate / SOLVE_RATE))
+    frames = np.arange(0, base.frame_count, step)
+    small = dataclasses.replace(base[frames], dt=np.asarray(base.dt, float) * step)
+    length = bucket(len(frames))
+    rows = frames[np.minimum(np.arange(length), len(frames) - 1)]
+    basis = bspline_basis(length, float(small.dt), KNOT_SPACING)
+    every = max(1, round(KNOT_SPACING / float(small.dt))) * step
+    whole = bspline_basis(base.frame_count, float(base.dt), every * float(base.dt))
+    controls = (*(arm_controls(character, base, whole) if "arms" in blocks else ()),
+                *(leg_controls(character, base, whole) if "legs" in blocks else ()))  # fmt: skip
+
+    def as_seen(control: Control) -> Control:
+        drives = tuple(
+            dataclasses.replace(d, axis_parent=d.axis_parent[rows]) if np.ndim(d.axis_parent) == 2 else d
+            for d in control.drives
+        )
+        return dataclasses.replace(control, drives=drives, basis=basis)
+
+    padded = dataclasses.replace(base[rows], dt=small.dt)
+    return controls, whole, Seen(frames, small, padded, basis, tuple(as_seen(c) for c in controls))
 
 
 def _final(controls: Sequence[Control], basis: Basis, correction: Correction) -> Correction:
@@ -160,121 +193,72 @@ def _final(controls: Sequence[Control], basis: Basis, correction: Correction) ->
     return Correction(tuple(controls), tuple(np.asarray(p)[: basis.count] for p in correction.points))
 
 
-def _solve_frames(base: Motion) -> Int[np.ndarray, " seen"]:
-    step = max(1, round(base.frame_rate / SOLVE_RATE))
-    return np.arange(0, base.frame_count, step)
-
-
-def _spacing(basis: Basis, small: Motion, base: Motion) -> float:
-    every = max(1, round(KNOT_SPACING / float(small.dt)))
-    return every * float(small.dt)
-
-
-def _at(control: Control, frames: np.ndarray, basis: Basis) -> Control:
-    """The control as the solver sees it: at some frames of the clip."""
-    drives = tuple(
-        dataclasses.replace(d, axis_parent=d.axis_parent[frames] if np.ndim(d.axis_parent) == 2 else d.axis_parent)
-        for d in control.drives
-    )
-    return dataclasses.replace(control, drives=drives, basis=basis)
-
-
-def _blocks_of(recipe: str, pairs: tuple[Pair, ...]) -> list[tuple[Block, tuple[Pair, ...]]]:
-    if recipe == "legs":
-        names = ("hip_turn", "thighs_apart")
-        return [(Block("legs", names, ("legs_clearance", "effort", "smoothness")), tuple(p for p in pairs if p.block == "legs"))]
+def _stages(
+    character: Character, blocks: Sequence[str], pairs: tuple[Pair, ...], objective: str,
+    allowed: Float[np.ndarray, "frames pairs"],
+) -> list[Stage]:  # fmt: skip
+    """The blocks of each recipe, in order: left arm, right arm, legs."""
     made = []
-    for side in ("left", "right"):
-        name = f"{side}_arm"
-        mine = tuple(p for p in pairs if p.block == "arms" and p.first.startswith(side))
-        made.append((Block(name, (name, f"{name}_across", f"{name}_twist"), (f"{name}_clearance", "effort", "smoothness")), mine))
+    for recipe in blocks:
+        if recipe == "arms":
+            wanted = [(f"{s}_arm", tuple(f"{s}_arm{k}" for k in ("", "_across", "_twist")),
+                       tuple(p for p in pairs if p.block == "arms" and p.first.startswith(s))) for s in SIDES]  # fmt: skip
+        else:
+            wanted = [("legs", ("hip_turn", "thighs_apart"), tuple(p for p in pairs if p.block == "legs"))]
+        for name, controls, mine in wanted:
+            clearance = build_clearance(character, mine, objective)
+            columns = [pairs.index(p) for p in clearance.pairs]
+            block = Block(name, controls, (f"{name}_clearance", "effort", "smoothness"))
+            made.append(Stage(block, clearance, columns, allowed[:, columns]))
     return made
 
 
-def _limits(clip, frames, character, reference, pairs, objective):
-    """Depth [m] that does not count, per frame and pair, and that of the joint itself, per pair."""
-    body = reference or character
-    clearance = build_clearance(body, pairs, objective)
-    if reference is None:
-        rest = volume_depths(clearance, rest_motion(body.skeleton))
-        return np.tile(rest, (len(frames), 1)), np.zeros(len(pairs))
-    moving, easy = onto(clip[frames], body.skeleton), _at_ease(body)
-    both = Motion(body.skeleton, np.concatenate([moving.root, easy.root]),
-                  np.concatenate([moving.rotations, easy.rotations]), moving.dt)  # fmt: skip
-    depths = volume_depths(clearance, both)
-    count = len(moving.root)
-    return depths[:count], depths[count:].max(axis=0) * np.array([p.adjacent for p in pairs])
-
-
-def _at_ease(body: Character) -> Motion:
-    """Standing with the arms hanging, and swung as in a walk."""
-    poses = [standing(body.skeleton, swing) for swing in (-0.35, 0.0, 0.35)]
-    return Motion(body.skeleton, np.concatenate([p.root for p in poses]),
-                  np.concatenate([p.rotations for p in poses]), poses[0].dt)  # fmt: skip
-
-
-class _Skin:
-    """Looks at the skinned mesh itself, at some frames of a clip: what the fields cannot tell near the shoulder.
-
-    There the skin follows arm and trunk at once, and the fold of the joint is not where a table of one pose says.
-    """
-
-    def __init__(self, clip: Motion, frames: np.ndarray, character: Character, reference: Character, pairs):
-        count = min(len(frames), max(LEAST_LOOKS, round(len(frames) * LOOK_SHARE)))
-        self.at = np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))
-        self.frames, self.character, self.pairs = np.arange(len(frames)), character, pairs
-        self.own = skin_depths(reference, onto(clip[frames[self.at]], reference.skeleton), pairs).depth
-        adjacent = np.array([p.adjacent for p in pairs])
-        if ("skin at ease", pairs) not in reference.memo:
-            reference.memo["skin at ease", pairs] = skin_depths(reference, _at_ease(reference), pairs).depth.max(axis=0)
-        self.at_ease = reference.memo["skin at ease", pairs] * adjacent
-
-    def depths(self, motion: Motion) -> Float[np.ndarray, "looks pairs"]:
-        return skin_depths(self.character, motion[self.at], self.pairs).depth
-
-    def quiet(self, seen: Float[np.ndarray, "looks pairs"]) -> Bool[np.ndarray, " pairs"]:
-        slack = np.array([SHOULDER_SLACK if p.first.endswith("upper_arm") else 1.0 for p in self.pairs])
-        return (seen - np.maximum(self.own, self.at_ease)).max(axis=0) <= slack * TOLERANCE
-
-    def beyond(
-        self, seen: Float[np.ndarray, "looks pairs"], excess: Float[np.ndarray, "frames pairs"]
-    ) -> Float[np.ndarray, "frames pairs"]:
-        """How much more excess [m] the skin shows than the fields, where it shows any; between looks interpolated."""
-        more = np.where(seen > 0, seen - self.own - excess[self.at], 0.0)
-        more = np.clip(more, 0.0, 0.05)
-        return np.stack([np.interp(self.frames, self.at, column) for column in more.T], axis=1)
+def _problem(
+    character: Character, seen: Seen, stages: list[Stage], beyond: Float[np.ndarray, "frames pairs"], smooth: float,
+    motions: tuple[Motion, ...],
+) -> Problem:  # fmt: skip
+    """The terms of all stages; probes are chosen by what they had to do with in `motions`."""
+    real, length = seen.motion.frame_count, seen.padded.frame_count
+    terms: dict[str, Term] = {}
+    for stage in stages:
+        # however much the skin shows: a part that is LEAST_GAP away from the other's field is pushed no further
+        limit = _smooth_floor(np.maximum(stage.allowed - beyond[:, stage.columns], -LEAST_GAP), float(seen.motion.dt))
+        # the frames that only fill the bucket cost nothing
+        limit = np.concatenate([limit, np.full((length - real, limit.shape[1]), 1e3)])
+        name = f"{stage.block.name}_clearance"
+        if stage.clearance.part_of_set:
+            score = sum(support(stage.clearance, motion, stage.allowed) for motion in motions)
+            terms[name] = reduced(stage.clearance, score, limit, SOLVE_PROBES)
+        else:
+            terms[name] = stage.clearance.allowing(limit)
+    frames = np.arange(length)
+    effort = Effort(np.array([SIGMA_EFFORT[c.name] for c in seen.controls]))
+    terms["effort"] = During(effort, (frames < real).astype(float))
+    terms["smoothness"] = During(Smoothness(smooth), (frames < real - 2).astype(float))
+    return Problem(character, seen.padded, terms, seen.controls)
 
 
 def _jerk_scale(base: Motion) -> float:
-    """[rad/s^3] that adds as much jerk at the hand as the clip has itself."""
-    positions = host_kinematics(base)[0][:, [base.skeleton.joint(f"{s}_hand") for s in ("left", "right")]]
-    positions = gaussian_filter1d(positions, 1 / (60 * float(base.dt)), axis=0, mode="nearest")  # not the noise
-    jerk = np.linalg.norm(np.diff(positions, 3, axis=0), axis=-1) / float(base.dt) ** 3 if len(positions) > 3 else np.zeros(1)
-    return JERK_SHARE * max(float(jerk.mean()), LEAST_JERK) / LEVER
+    """[rad/s^3] of a shoulder that adds as much jerk at the hand as the clip has itself, noise left out."""
+    dt = float(base.dt)
+    hands = [j for s in SIDES if (j := base.skeleton.find(f"{s}_hand")) is not None]
+    if base.frame_count < 4 or not hands:
+        return JERK_SHARE * LEAST_JERK / LEVER
+    positions = gaussian_filter1d(host_kinematics(base)[0][:, hands], 1 / (SOLVE_RATE * dt), axis=0, mode="nearest")
+    jerk = float(np.linalg.norm(np.diff(positions, 3, axis=0), axis=-1).mean()) / dt**3
+    return JERK_SHARE * max(jerk, LEAST_JERK) / LEVER
 
 
-def _problem(character, padded, small, stages, beyond, controls, smooth, objective, after) -> Problem:
-    real = small.frame_count
-    mask = (np.arange(padded.frame_count) < real).astype(float)
-    inner = (np.arange(padded.frame_count) < real - 2).astype(float)
-    terms: dict[str, Term] = {}
-    for stage in stages:
-        far = np.full((padded.frame_count - real, stage.allowed.shape[1]), 1e3)
-        allowed = np.concatenate([stage.allowed - beyond[:, stage.columns], far])
-        clearance = stage.clearance
-        if objective == "vertex":
-            score = sum(support(clearance, m, stage.allowed) for m in ((small,) if after is None else (small, after)))
-            terms[stage.block.terms[0]] = reduced(clearance, score, allowed, SOLVE_PROBES)
-        else:
-            terms[stage.block.terms[0]] = clearance.allowing(allowed)
-    effort = Effort(np.array([SIGMA_EFFORT[c.name] for c in controls]))
-    terms |= {"effort": During(effort, mask), "smoothness": During(Smoothness(smooth), inner)}
-    return Problem(character, padded, terms, controls)
+def _smooth_floor(limit: Float[np.ndarray, "frames pairs"], dt: float) -> Float[np.ndarray, "frames pairs"]:
+    """The limit without its jumps, nowhere above it by much: what a spline can follow without a jerk."""
+    width = max(1, round(0.05 / dt))
+    return gaussian_filter1d(minimum_filter1d(limit, 2 * width + 1, axis=0), width, axis=0, mode="nearest")
 
 
-def _tighten(stage: Stage, over: Float[np.ndarray, "frames pairs"], dt: float) -> Stage:
+def _tighten(stage: Stage, left: Float[np.ndarray, "frames pairs"], dt: float) -> Stage:
     """Less may stay where the solve left more [m] than it was allowed: per pair, around the frames that show it."""
-    more = np.where(over > 0.001, over, 0.0)
+    more = np.where(left > 0.001, left, 0.0)
+    # wide enough for a spline to follow, and nowhere less than what the frame itself needs
     width = max(1, round(0.1 / dt))
     more = gaussian_filter1d(maximum_filter1d(more, 2 * width + 1, axis=0), width / 2, axis=0, mode="nearest")
     return stage._replace(allowed=stage.allowed - np.minimum(1.3 * more, 0.02))
