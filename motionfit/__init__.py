@@ -8,7 +8,7 @@ mf.save("adapted.glb", fit.motion, mf.load_character("heavy.glb"))
 
 __version__ = "0.1.0"
 
-from motionfit import adapt, metrics, shape, terms
+from motionfit import adapt, balance, dynamics, metrics, shape, terms
 from motionfit import rotation as rotation
 from motionfit import splines as splines
 from motionfit._character import Character as Character
@@ -41,7 +41,7 @@ from motionfit.metrics import measure as measure
 
 __all__ = [
     "Block", "Character", "Control", "Correction", "Custom", "Drive", "During", "Energy", "Fit", "InputError",
-    "Kinematics", "Motion", "Problem", "Robust", "Skeleton", "Skin", "Term", "adapt", "fit", "forward_kinematics",
+    "Kinematics", "Motion", "Problem", "Robust", "Skeleton", "Skin", "Term", "adapt", "balance", "dynamics", "fit", "forward_kinematics",
     "load_character", "load_correction", "load_motion", "measure", "metrics", "onto", "resample", "rotation", "save",
     "shape", "skin", "splines", "terms",
 ]  # fmt: skip

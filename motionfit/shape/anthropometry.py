@@ -4,9 +4,7 @@ P. de Leva, Adjustments to Zatsiorsky-Seluyanov's segment inertia parameters, J.
 gamma-ray scans of 100 men and 15 women (mean age 24 and 19, 73.0 kg and 61.9 kg).
 """
 
-from typing import Literal, NamedTuple, TypeAlias
-
-Sex: TypeAlias = Literal["male", "female"]
+from typing import NamedTuple
 
 
 class Segment(NamedTuple):

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
@@ -17,7 +18,7 @@ from motionfit._character import Character
 from motionfit._motion import bind_pose
 from motionfit._skeleton import SIDES, Skeleton
 from motionfit._types import AnyArray, InputError
-from motionfit.shape.anthropometry import SEGMENTS, Sex
+from motionfit.shape.anthropometry import SEGMENTS
 from motionfit.shape.cutting import cut_and_cap, solid_moments
 from motionfit.shape.volumes import Volumes, bone_tips
 
@@ -62,9 +63,9 @@ class Masses(eqx.Module):
             raise InputError("all masses are zero; a body needs some mass")
 
     @property
-    def total(self) -> Float[AnyArray, ""]:
+    def total(self) -> Float[Array, ""]:
         """[kg]"""
-        return self.mass.sum()
+        return jnp.sum(jnp.asarray(self.mass))
 
     def limbs(self) -> dict[str, float]:
         """Mass [kg] of each limb of thesis table 5.1."""
@@ -240,7 +241,7 @@ def mass_volumes(character: Character, kind: str = "cylinder") -> Volumes:
 # --- from an anthropometric table ---------------------------------------------------------------------------------
 
 
-def anthropometric_masses(character: Character, total: float | None = None, sex: Sex = "male") -> Masses:
+def anthropometric_masses(character: Character, total: float | None = None, sex: str = "male") -> Masses:
     """Masses, centres and inertia of de Leva 1996, table 4, scaled to the total mass [kg] and the character's bones.
 
     `total` is that of the closed mesh where it is not given. The table's end points that no joint marks are taken
@@ -255,6 +256,7 @@ def anthropometric_masses(character: Character, total: float | None = None, sex:
     positions, rotations = bind_pose(skeleton)
     ends = _landmarks(character, sex)
     rows = []
+    whole = sum(row.mass for row in SEGMENTS[sex].values())  # the printed shares: 100.00 (men) and 99.99 % (women)
     for role, row in SEGMENTS[sex].items():
         joint = _carrier(skeleton, role, positions, ends)
         start, end = ends[role]
@@ -263,17 +265,16 @@ def anthropometric_masses(character: Character, total: float | None = None, sex:
         side = np.array([1.0, 0.0, 0.0]) - axis[0] * axis  # the transverse axis: left-right in the bind pose
         side = side / np.linalg.norm(side) if np.linalg.norm(side) > 0.5 else np.cross(axis, [0.0, 0.0, 1.0])
         frame = np.stack([np.cross(side, axis), side, axis])  # rows: sagittal, transverse, longitudinal
-        mass = row.mass * total
+        mass = row.mass / whole * total
         inertia = frame.T @ np.diag(mass * (np.array(row.gyration) * length) ** 2) @ frame
         turn = Rotation.from_quat(rotations[joint], scalar_first=True).as_matrix()
         centre = turn.T @ (start + row.centre * (end - start) - positions[joint])
         rows.append((skeleton.role_of_joint.get(joint, role), joint, mass, centre, turn.T @ inertia @ turn))
     roles, joints, mass, centre, inertia = zip(*rows, strict=True)
-    mass = np.array(mass) * total / np.sum(mass)  # the printed shares add up to 100.00 (men) and 99.99 % (women)
-    return Masses(roles, joints, mass, np.array(centre), np.array(inertia))
+    return Masses(roles, joints, np.array(mass), np.array(centre), np.array(inertia))
 
 
-def _landmarks(character: Character, sex: Sex) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _landmarks(character: Character, sex: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Bind positions [m] of both end points of every row of the table."""
     skeleton = character.skeleton
     positions = bind_pose(skeleton)[0]
