@@ -15,8 +15,19 @@ import motionfit as mf
 from motionfit import samples
 from motionfit._motion import rest_motion
 from motionfit.balance import (
-    FLIGHT, GRAVITY, angular_momentum, balance_measures, centre_of_mass, hull_distance, linear_momentum,
-    optimised_masses, smooth_derivatives, sole_boxes, support_distance, support_polygon, zero_moment_point,
+    FLIGHT,
+    GRAVITY,
+    angular_momentum,
+    balance_measures,
+    centre_of_mass,
+    hull_distance,
+    linear_momentum,
+    optimised_masses,
+    smooth_derivatives,
+    sole_boxes,
+    support_distance,
+    support_polygon,
+    zero_moment_point,
     zmp_distance,
 )  # fmt: skip
 from motionfit.shape.mass import LIMBS, Masses, mass_volumes, mesh_masses, volume_masses
@@ -191,7 +202,9 @@ def test_zmp_moves_with_the_body_and_ignores_the_total_mass(seed, scale):
     own = Rotation.from_quat(rotations[:, 0].copy(), scalar_first=True)
     rotations[:, 0] = (heading * own).as_quat(scalar_first=True)
     moved = mf.Motion(motion.skeleton, heading.apply(np.array(motion.root)) + shift, rotations, 1 / 60)
-    heavier = Masses(masses.roles, masses.joints, scale * masses.mass, masses.centre_joint, scale * masses.inertia_joint)
+    heavier = Masses(
+        masses.roles, masses.joints, scale * masses.mass, masses.centre_joint, scale * masses.inertia_joint
+    )
     first = zero_moment_point(mf.forward_kinematics(motion.skeleton, motion), masses)
     second = zero_moment_point(mf.forward_kinematics(moved.skeleton, moved), heavier)
     np.testing.assert_allclose(second.load, first.load, atol=1e-8)
@@ -266,7 +279,12 @@ def test_two_identical_feet_side_by_side_have_one_clean_hull():
     """Collinear corners, as two parallel soles have: no edge is lost or doubled into a wrong sign."""
     box = np.array([[0.0, 0.0], [0.1, 0.0], [0.1, 0.3], [0.0, 0.3]])
     corners = np.concatenate([box, box + [0.2, 0.0]])
-    for point, expected in (([0.15, 0.15], -0.15), ([0.15, 0.02], -0.02), ([0.15, 0.4], 0.1), ([0.4, 0.4], np.sqrt(0.02))):
+    for point, expected in (
+        ([0.15, 0.15], -0.15),
+        ([0.15, 0.02], -0.02),
+        ([0.15, 0.4], 0.1),
+        ([0.4, 0.4], np.sqrt(0.02)),
+    ):
         value = hull_distance(jnp.asarray(point), jnp.asarray(corners), jnp.ones(8, bool))
         assert float(value) == pytest.approx(expected, abs=1e-9)
     ring = support_polygon(corners)

@@ -14,7 +14,15 @@ from motionfit._motion import bind_pose, rest_motion
 from motionfit.shape.anthropometry import SEGMENTS
 from motionfit.shape.cutting import cut_and_cap, solid_moments
 from motionfit.shape.mass import (
-    LIMBS, RADIUS_SCALES, Masses, anthropometric_masses, density_of, limb_of, mass_volumes, mesh_masses, volume_masses,
+    LIMBS,
+    RADIUS_SCALES,
+    Masses,
+    anthropometric_masses,
+    density_of,
+    limb_of,
+    mass_volumes,
+    mesh_masses,
+    volume_masses,
 )  # fmt: skip
 from motionfit.shape.volumes import Volumes, fit_volumes
 from tests.helpers import central_difference

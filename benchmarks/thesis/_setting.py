@@ -98,7 +98,10 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence], out: pat
     widths = [max(len(c) for c in column) for column in zip(columns, *cells, strict=True)]
     print(f"\n{title}")
     for line in (list(columns), ["-" * w for w in widths], *cells):
-        print("  " + "  ".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(line, widths, strict=True))))
+        print(
+            "  "
+            + "  ".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(line, widths, strict=True)))
+        )
     out.mkdir(parents=True, exist_ok=True)
     text = "\n".join(",".join(f'"{c}"' if "," in c else c for c in line) for line in (list(columns), *cells))
     (out / f"{name}.csv").write_text(text + "\n", encoding="utf-8")

@@ -7,10 +7,10 @@ from jaxtyping import Bool, Float
 
 from motionfit._motion import Kinematics
 from motionfit._problem import Term
+from motionfit._types import AnyArray
 from motionfit.balance import FLIGHT, WINDOW, Soles, support_distance, zero_moment_point
 from motionfit.shape.mass import Masses
 from motionfit.terms.penetration import hinge
-from motionfit._types import AnyArray
 
 
 def _array(x):
