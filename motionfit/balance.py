@@ -259,6 +259,19 @@ def hull_distance(
     return jnp.where(some, jnp.where(within, -depth, outside), 0.0)
 
 
+def nearest_in_hull(
+    point: Float[AnyArray, "*batch 2"],
+    corners: Float[AnyArray, "*batch corners 2"],
+    present: Bool[AnyArray, "*batch corners"],
+) -> Float[Array, "*batch 2"]:
+    """The point of the hull nearest to each point; points inside stay. (The gradient of a distance points away from
+    what it is measured to.)"""
+    point = jnp.asarray(point)
+    distance, pull = jax.vjp(lambda p: hull_distance(p, corners, present), point)
+    (away,) = pull(jnp.ones_like(distance))
+    return point - jnp.maximum(distance, 0.0)[..., None] * away
+
+
 def support_polygon(corners: Float[AnyArray, "corners 2"]) -> Float[np.ndarray, "hull 2"]:
     """The corners of the convex hull in order around it, on the host (SciPy); for plots and files."""
     from scipy.spatial import ConvexHull, QhullError

@@ -12,6 +12,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 import motionfit as mf
+from benchmarks.thesis._setting import planted_feet
 from motionfit import samples
 from motionfit._motion import rest_motion
 from motionfit.balance import (
@@ -22,6 +23,7 @@ from motionfit.balance import (
     centre_of_mass,
     hull_distance,
     linear_momentum,
+    nearest_in_hull,
     optimised_masses,
     smooth_derivatives,
     sole_boxes,
@@ -248,7 +250,11 @@ def test_hull_distance_is_scipys(seed, count, near):
     present = np.zeros(8, bool)
     present[rng.permutation(8)[:count]] = True
     distance = hull_distance(jnp.asarray(point), jnp.asarray(corners), jnp.asarray(present))
-    assert float(distance) == pytest.approx(_oracle(point, corners[present]), abs=1e-9)
+    expected = _oracle(point, corners[present])
+    assert float(distance) == pytest.approx(expected, abs=1e-9)
+    nearest = np.asarray(nearest_in_hull(jnp.asarray(point), jnp.asarray(corners), jnp.asarray(present)))
+    assert np.linalg.norm(nearest - point) == pytest.approx(max(expected, 0.0), abs=1e-9)
+    assert _oracle(nearest, corners[present]) <= 1e-9
 
 
 def test_hull_distance_of_less_than_a_polygon():
@@ -343,8 +349,7 @@ def test_optimised_masses_come_nearer_to_the_support_at_the_same_total(average):
     motion = mf.onto(samples.walk(cycles=1), average.skeleton)
     kin, soles = mf.forward_kinematics(average.skeleton, motion), sole_boxes(average)
     masses = volume_masses(mass_volumes(average))
-    low = np.asarray(soles.corners_world(kin))[..., 1].min(-1)
-    planted = low < 0.03
+    planted = planted_feet(average, motion).feet
     found = optimised_masses(kin, masses, soles, planted)
     assert float(found.total) == pytest.approx(float(masses.total))
     assert min(found.limbs()[limb] for limb in LIMBS) >= 0
@@ -423,7 +428,7 @@ def _slope(problem, x):
 def test_zmp_margin_asks_for_nothing_that_the_original_did_not_have(heavy):
     motion = mf.onto(samples.walk(cycles=1), heavy.skeleton)
     kin, soles = mf.forward_kinematics(heavy.skeleton, motion), sole_boxes(heavy)
-    planted = np.asarray(soles.corners_world(kin))[..., 1].min(-1) < 0.03
+    planted = planted_feet(heavy, motion).feet
     original = zmp_distance(kin, mesh_masses(heavy), soles, planted)
     assert np.asarray(original.outside).max() > 0.003  # a walk leaves its support: thesis 5.6.2
     kept = _margin(heavy, motion, planted, threshold=np.asarray(original.outside))

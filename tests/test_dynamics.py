@@ -1,5 +1,6 @@
 """Inverse dynamics against pendulums in closed form, the power balance, statics, and MuJoCo."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,9 +8,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import motionfit as mf
+from benchmarks.thesis._setting import planted_feet
 from motionfit import rotation, samples
 from motionfit._motion import rest_motion
-from motionfit.balance import GRAVITY, angular_velocities, centre_of_mass, sole_boxes, velocities, zero_moment_point
+from motionfit.balance import (
+    GRAVITY,
+    angular_velocities,
+    centre_of_mass,
+    sole_boxes,
+    support_distance,
+    velocities,
+    zero_moment_point,
+)
 from motionfit.dynamics import (
     STRENGTH,
     feasibility,
@@ -76,7 +86,9 @@ def _waving(seed, joints=6, frames=120):
     waves = np.sin(2 * np.pi * np.outer(t, rng.uniform(0.5, 1.5, 3 + 3 * joints)) + rng.uniform(0, 6, 3 + 3 * joints))
     turns = Rotation.from_rotvec(0.6 * waves[:, 3:].reshape(-1, 3)).as_quat(scalar_first=True)
     motion = mf.Motion(skeleton, 0.2 * waves[:, :3] + [0, 1, 0], turns.reshape(frames, joints, 4), 1 / RATE)
-    inertia = np.stack([x @ x.T + 0.01 * np.eye(3) for x in 0.1 * rng.normal(size=(joints, 3, 3))])
+    # from second moments, so that no moment of inertia is above the sum of the other two
+    moments = [x @ x.T + 0.01 * np.eye(3) for x in 0.1 * rng.normal(size=(joints, 3, 3))]
+    inertia = np.stack([np.trace(c) * np.eye(3) - c for c in moments])
     masses = Masses(("hips",) * joints, tuple(range(joints)), rng.uniform(0.5, 4, joints),
                     0.1 * rng.normal(size=(joints, 3)), inertia)  # fmt: skip
     return skeleton, motion, masses
@@ -135,7 +147,13 @@ def test_standing(heavy):
     lever = np.asarray(centres_world(kin, masses))[0, arm] - np.asarray(kin.positions_world)[0, joint]
     expected = np.cross(lever, GRAVITY * np.asarray(masses.mass)[arm, None] * np.array([0, 1, 0])).sum(0)
     np.testing.assert_allclose(loads.torque[0, joint], expected, atol=1e-6)
-    # on one leg that leg takes all, and the other one hangs
+    # on one leg the ground pushes at the sole's edge, and what it cannot hold is missing at the root
+    edge = inverse_dynamics(heavy.skeleton, kin, masses, soles, np.tile([False, True], (6, 1)))
+    outside = support_distance(com, soles.corners_world(kin), np.tile([False, True], (6, 1)))
+    missing = np.linalg.norm(np.asarray(edge.torque)[:, 0], axis=-1) / weight
+    assert (np.asarray(outside) > 0.01).all()
+    np.testing.assert_allclose(missing, outside, atol=1e-9)
+    # that leg takes all, and the other one hangs
     one = inverse_dynamics(heavy.skeleton, kin, masses, soles, np.tile([True, False], (6, 1)))
     np.testing.assert_allclose(one.ground_force[:, 0, 1], weight, atol=1e-6)
     np.testing.assert_array_equal(one.ground_force[:, 1], 0.0)
@@ -146,10 +164,13 @@ def test_the_reaction_acts_at_the_zero_moment_point(average):
     motion = mf.onto(samples.walk(cycles=1), average.skeleton)
     kin, masses, soles = mf.forward_kinematics(average.skeleton, motion), mesh_masses(average), sole_boxes(average)
     planted = np.tile([True, False], (motion.frame_count, 1))
+    # on skis no reaction is outside the support
+    soles = eqx.tree_at(lambda s: s.corners_joint, soles, np.asarray(soles.corners_joint) * np.array([60.0, 1.0, 60.0]))
     loads = inverse_dynamics(average.skeleton, kin, masses, soles, planted, ground=0.01)
     zmp = zero_moment_point(kin, masses, ground=0.01)
-    # the two filter different signals: the segments' paths, or the whole body's momenta
-    np.testing.assert_allclose(np.asarray(loads.ground_point)[2:-2, 0], zmp.point_world[2:-2], atol=2e-3)
+    # the two filter different signals, the segments' paths or the whole body's momenta: equal where those are smooth
+    apart = np.linalg.norm(np.asarray(loads.ground_point)[6:-6, 0] - np.asarray(zmp.point_world)[6:-6], axis=-1)
+    assert np.median(apart) < 2e-3 and apart.max() < 0.02
     np.testing.assert_allclose(loads.force[:, 0], 0.0, atol=1e-6)
     np.testing.assert_allclose(loads.torque[:, 0], 0.0, atol=1e-5)
     # both feet down: the same wrench, shared
@@ -246,20 +267,18 @@ def test_newton_euler_carries_a_load_to_the_root():
 
 
 def test_strength_limits():
-    limits = strength_limits(75.0, 1.78)
+    limits = strength_limits(75.0, 1.78, deviations=0.0)
     assert set(limits) == set(STRENGTH)
     # orders of magnitude of any dynamometer study of young men
     assert 180 < limits["knee_extension"] < 260 and 100 < limits["ankle_plantarflexion"] < 160
     assert 35 < limits["elbow"] < 80
+    strong = strength_limits(75.0, 1.78)
+    assert all(1.2 * limits[k] < strong[k] < 1.8 * limits[k] for k in limits)
     assert strength_limits(160.0, 1.76) == strength_limits(120.0, 1.76)  # fat does not pull
     with pytest.raises(mf.InputError, match="0 kg"):
         strength_limits(0.0, 1.7)
     with pytest.raises(mf.InputError, match="male, female"):
         strength_limits(70.0, 1.7, "x")
-
-
-def _planted(kin, soles):
-    return np.asarray(soles.corners_world(kin))[..., 1].min(-1) < 0.03
 
 
 def test_a_crouch_strains_the_knees_and_a_lean_the_ankles(average):
@@ -288,14 +307,15 @@ def test_a_crouch_strains_the_knees_and_a_lean_the_ankles(average):
 @pytest.mark.slow
 def test_a_walk_is_feasible_and_the_same_walk_four_times_as_fast_is_not(average):
     motion = mf.onto(samples.walk(cycles=2), average.skeleton)
-    masses, soles = mesh_masses(average), sole_boxes(average)
+    masses = mesh_masses(average)
+    soles, planted, ground = planted_feet(average, motion)
     kin = mf.forward_kinematics(average.skeleton, motion)
-    found = feasibility(average.skeleton, kin, masses, soles, _planted(kin, soles), 1.75)
+    found = feasibility(average.skeleton, kin, masses, soles, planted, 1.75, ground=ground)
     assert found.feasible, found.report()
-    assert found.residual is not None and found.residual < 1e-6
+    assert found.residual is not None and found.residual < 0.05
     fast = mf.Motion(motion.skeleton, motion.root, motion.rotations, float(motion.dt) / 4)
     kin = mf.forward_kinematics(average.skeleton, fast)
-    strained = feasibility(average.skeleton, kin, masses, soles, _planted(kin, soles), 1.75)
+    strained = feasibility(average.skeleton, kin, masses, soles, planted, 1.75, ground=ground)
     assert not strained.feasible and "not feasible" in strained.report()
     assert all(np.isfinite(v) for v in [*strained.peak.values(), *strained.limit.values()])
 

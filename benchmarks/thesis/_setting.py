@@ -9,7 +9,7 @@ import numpy as np
 
 import motionfit as mf
 from motionfit import samples
-from motionfit._motion import host_kinematics
+from motionfit._motion import bind_pose, host_kinematics
 from motionfit.balance import Soles, sole_boxes
 from motionfit.shape.mass import Masses, anthropometric_masses, mass_volumes, mesh_masses, volume_masses
 from motionfit.shape.volumes import fit_volumes
@@ -66,22 +66,21 @@ class Planted(NamedTuple):
 
 
 def planted_feet(character: mf.Character, motion: mf.Motion, height: float = 0.05, speed: float = 0.5) -> Planted:
-    """A foot is down where its lowest point is within `height` [m] of the floor and the slower of ankle and toe
-    moves at less than `speed` [m/s]: the fixed thresholds of the classics, enough to label a benchmark. The floor is
-    the second percentile of the lowest sole corner."""
-    soles = sole_boxes(character)
-    positions, rotations = host_kinematics(motion)
-    from scipy.spatial.transform import Rotation
+    """A foot is down where its heel or ball is within `height` [m] of the floor and the slower of ankle and toe moves
+    at less than `speed` [m/s]: the fixed thresholds of the classics, enough to label a benchmark.
 
+    Heights are those of the ankle and the toe joint over their height above the sole in the bind pose (the corners
+    of the rigid sole box dip into the floor where the toes bend); the floor is their second percentile.
+    """
+    skeleton, soles = character.skeleton, sole_boxes(character)
+    positions, bind = host_kinematics(motion)[0], bind_pose(skeleton)[0]
+    sole = np.asarray(character.skin.vertices_bind)[:, 1].min()
     lows, slow = [], []
-    for k, (side, joint) in enumerate(zip(("left", "right"), soles.joints, strict=True)):
-        turn = Rotation.from_quat(rotations[:, joint], scalar_first=True)
-        corners = [positions[:, joint] + turn.apply(c) for c in np.asarray(soles.corners_joint)[k]]
-        toe = motion.skeleton.find(f"{side}_toe")
-        points = [positions[:, joint]] + ([] if toe is None else [positions[:, toe]])
-        lows.append(np.min(corners, axis=0)[:, 1])
-        rates = [np.linalg.norm(np.gradient(p, float(motion.dt), axis=0), axis=-1) for p in points]
-        slow.append(np.min(rates, axis=0) < speed)
+    for side in ("left", "right"):
+        joints = [j for role in ("foot", "toe") if (j := skeleton.find(f"{side}_{role}")) is not None]
+        path = positions[:, joints]
+        lows.append((path[..., 1] - (bind[joints, 1] - sole)).min(axis=1))
+        slow.append(np.linalg.norm(np.gradient(path, float(motion.dt), axis=0), axis=-1).min(axis=1) < speed)
     low = np.stack(lows, axis=1)
     ground = float(np.percentile(low.min(axis=1), 2))
     return Planted(soles, (low < ground + height) & np.stack(slow, axis=1), ground)
