@@ -104,3 +104,19 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence], out: pat
     out.mkdir(parents=True, exist_ok=True)
     text = "\n".join(",".join(f'"{c}"' if "," in c else c for c in line) for line in (list(columns), *cells))
     (out / f"{name}.csv").write_text(text + "\n", encoding="utf-8")
+
+
+def save_figure(path: pathlib.Path, title: str, draw: Callable) -> None:
+    """One plot, drawn by `draw(axes)`, without a display."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure, axes = plt.subplots(figsize=(9, 5), layout="constrained")
+    axes.set_title(title)
+    draw(axes)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+    print(f"  plot: {path}")
