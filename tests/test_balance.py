@@ -35,6 +35,10 @@ from motionfit.balance import (
 from motionfit.shape.mass import LIMBS, Masses, mass_volumes, mesh_masses, volume_masses
 from tests.helpers import central_difference, random_motion
 
+# one program per clip length instead of one per operation
+kinematics = eqx.filter_jit(mf.forward_kinematics)
+hull = jax.jit(hull_distance)
+
 EXACT = 1e-9  # what passes through the filter unchanged [m]
 FILTERED = 2e-3  # the filter's own error on a smooth motion [m]
 RELATIVE = 1e-5  # analytic against central differences in double precision
@@ -45,7 +49,7 @@ def _body(positions, turns, rate, mass=1.0, centre=(0.0, 0.0, 0.0), inertia=0.0)
     skeleton = mf.Skeleton(["body"], [-1], np.zeros((1, 3)))
     motion = mf.Motion(skeleton, np.asarray(positions, float), turns.as_quat(scalar_first=True)[:, None], 1.0 / rate)
     masses = Masses(("hips",), (0,), np.array([mass]), np.array([centre], float), np.array([inertia * np.eye(3)]))
-    return mf.forward_kinematics(skeleton, motion), masses
+    return kinematics(skeleton, motion), masses
 
 
 @given(st.sampled_from([3, 4, 60]), st.floats(0.0, 0.2), st.sampled_from([24.0, 60.0, 120.0]), st.integers(0, 2**31))
@@ -83,7 +87,7 @@ def test_one_and_two_frames_are_enough():
 def test_a_static_pose_has_its_zmp_under_the_centre_of_mass(heavy, spin):
     motion = samples.walk(cycles=1)
     still = mf.onto(motion, heavy.skeleton)[np.full(20, 17)]
-    kin, masses = mf.forward_kinematics(heavy.skeleton, still), mesh_masses(heavy)
+    kin, masses = kinematics(heavy.skeleton, still), mesh_masses(heavy)
     zmp = zero_moment_point(kin, masses, spin=spin, ground=0.02)
     com = np.asarray(centre_of_mass(kin, masses))
     np.testing.assert_allclose(zmp.point_world[:, [0, 2]], com[:, [0, 2]], atol=EXACT)
@@ -177,7 +181,7 @@ def _smooth_motion(seed, rate=1000.0, frames=300):
 def test_it_is_the_printed_sum_over_the_bodies(seed):
     """Thesis 4.7: x = sum m ((y'' + g) x - x'' y) / sum m (y'' + g), z alike."""
     skeleton, motion, masses = _smooth_motion(seed)
-    kin = mf.forward_kinematics(skeleton, motion)
+    kin = kinematics(skeleton, motion)
     local = jnp.asarray(masses.centre_joint)[None]
     from motionfit import rotation
 
@@ -207,8 +211,8 @@ def test_zmp_moves_with_the_body_and_ignores_the_total_mass(seed, scale):
     heavier = Masses(
         masses.roles, masses.joints, scale * masses.mass, masses.centre_joint, scale * masses.inertia_joint
     )
-    first = zero_moment_point(mf.forward_kinematics(motion.skeleton, motion), masses)
-    second = zero_moment_point(mf.forward_kinematics(moved.skeleton, moved), heavier)
+    first = zero_moment_point(kinematics(motion.skeleton, motion), masses)
+    second = zero_moment_point(kinematics(moved.skeleton, moved), heavier)
     np.testing.assert_allclose(second.load, first.load, atol=1e-8)
     ok = np.asarray(first.load) > FLIGHT
     expected = heading.apply(np.array(first.point_world)) + shift
@@ -220,11 +224,11 @@ def test_zmp_gradient():
 
     def total(turns):
         turned = mf.Motion(skeleton, motion.root, turns, motion.dt)
-        zmp = zero_moment_point(mf.forward_kinematics(skeleton, turned), masses)
+        zmp = zero_moment_point(kinematics(skeleton, turned), masses)
         return jnp.sum(jnp.sin(zmp.point_world)) + jnp.sum(zmp.load)
 
     turns = np.asarray(motion.rotations)
-    gradient = np.asarray(jax.grad(total)(jnp.asarray(turns)))
+    gradient = np.asarray(jax.jit(jax.grad(total))(jnp.asarray(turns)))
     expected = central_difference(jax.jit(total), turns)
     np.testing.assert_allclose(gradient, expected, atol=RELATIVE * np.abs(expected).max())
 
@@ -243,16 +247,19 @@ def _oracle(point, corners):
     return -best if inside else best
 
 
+nearest_jit = jax.jit(nearest_in_hull)
+
+
 @given(st.integers(0, 2**31), st.integers(3, 8), st.booleans())
 def test_hull_distance_is_scipys(seed, count, near):
     rng = np.random.default_rng(seed)
     corners, point = rng.normal(size=(8, 2)), rng.normal(size=2) * (0.5 if near else 3.0)
     present = np.zeros(8, bool)
     present[rng.permutation(8)[:count]] = True
-    distance = hull_distance(jnp.asarray(point), jnp.asarray(corners), jnp.asarray(present))
+    distance = hull(jnp.asarray(point), jnp.asarray(corners), jnp.asarray(present))
     expected = _oracle(point, corners[present])
     assert float(distance) == pytest.approx(expected, abs=1e-9)
-    nearest = np.asarray(nearest_in_hull(jnp.asarray(point), jnp.asarray(corners), jnp.asarray(present)))
+    nearest = np.asarray(nearest_jit(jnp.asarray(point), jnp.asarray(corners), jnp.asarray(present)))
     assert np.linalg.norm(nearest - point) == pytest.approx(max(expected, 0.0), abs=1e-9)
     assert _oracle(nearest, corners[present]) <= 1e-9
 
@@ -264,7 +271,7 @@ def test_hull_distance_of_less_than_a_polygon():
         (line, [1.0, 0.5], 0.5), (line, [3.0, 0.0], 1.0), (line, [1.5, 0.0], 0.0), (one, [2.0, -2.0], 2.0),
         (none, [5.0, 5.0], 0.0),
     ):  # fmt: skip
-        value, slope = jax.value_and_grad(hull_distance)(jnp.asarray(point), corners, jnp.asarray(present))
+        value, slope = jax.jit(jax.value_and_grad(hull_distance))(jnp.asarray(point), corners, jnp.asarray(present))
         assert float(value) == pytest.approx(expected, abs=1e-12) and np.isfinite(slope).all()
     np.testing.assert_array_equal(support_polygon(np.zeros((4, 2))), [[0.0, 0.0]])
 
@@ -278,7 +285,9 @@ def test_hull_distance_gradient(rng):
         return jnp.sum(hull_distance(x[:, 0], x[:, 1:], jnp.asarray(present)) ** 2)
 
     x = np.concatenate([points[:, None], corners], axis=1)
-    np.testing.assert_allclose(jax.grad(total)(jnp.asarray(x)), central_difference(jax.jit(total), x), atol=1e-6)
+    np.testing.assert_allclose(
+        jax.jit(jax.grad(total))(jnp.asarray(x)), central_difference(jax.jit(total), x), atol=1e-6
+    )
 
 
 def test_two_identical_feet_side_by_side_have_one_clean_hull():
@@ -291,7 +300,7 @@ def test_two_identical_feet_side_by_side_have_one_clean_hull():
         ([0.15, 0.4], 0.1),
         ([0.4, 0.4], np.sqrt(0.02)),
     ):
-        value = hull_distance(jnp.asarray(point), jnp.asarray(corners), jnp.ones(8, bool))
+        value = hull(jnp.asarray(point), jnp.asarray(corners), jnp.ones(8, bool))
         assert float(value) == pytest.approx(expected, abs=1e-9)
     ring = support_polygon(corners)
     area = np.sum(np.cross(np.pad(ring, ((0, 0), (0, 1))), np.pad(np.roll(ring, -1, 0), ((0, 0), (0, 1))))[:, 2]) / 2
@@ -300,7 +309,7 @@ def test_two_identical_feet_side_by_side_have_one_clean_hull():
 
 def test_sole_boxes_lie_under_the_feet(heavy):
     soles = sole_boxes(heavy)
-    corners = np.asarray(soles.corners_world(mf.forward_kinematics(heavy.skeleton, rest_motion(heavy.skeleton))))[0]
+    corners = np.asarray(soles.corners_world(kinematics(heavy.skeleton, rest_motion(heavy.skeleton))))[0]
     vertices = np.asarray(heavy.skin.vertices_bind)
     assert np.abs(corners[..., 1] - vertices[:, 1].min()).max() < 0.01
     length = np.linalg.norm(corners[:, 3] - corners[:, 0], axis=-1)
@@ -312,7 +321,7 @@ def test_sole_boxes_lie_under_the_feet(heavy):
 
 def test_standing_is_supported_and_leaning_is_not(heavy):
     motion = rest_motion(heavy.skeleton)[np.zeros(10, int)]
-    kin, masses, soles = mf.forward_kinematics(heavy.skeleton, motion), mesh_masses(heavy), sole_boxes(heavy)
+    kin, masses, soles = kinematics(heavy.skeleton, motion), mesh_masses(heavy), sole_boxes(heavy)
     both = np.ones((10, 2), bool)
     standing = zmp_distance(kin, masses, soles, both)
     assert (np.asarray(standing.signed) < 0).all() and np.asarray(standing.supported).all()
@@ -333,7 +342,7 @@ def test_standing_is_supported_and_leaning_is_not(heavy):
 def test_support_follows_the_feet(heavy):
     """The distance is that of the moved sole: a step sideways takes the support along."""
     soles = sole_boxes(heavy)
-    kin = mf.forward_kinematics(heavy.skeleton, rest_motion(heavy.skeleton)[np.zeros(3, int)])
+    kin = kinematics(heavy.skeleton, rest_motion(heavy.skeleton)[np.zeros(3, int)])
     corners = soles.corners_world(kin)
     middle = jnp.mean(corners[:, 0], axis=1)
     planted = jnp.asarray([[True, False]] * 3)
@@ -347,7 +356,7 @@ def test_support_follows_the_feet(heavy):
 
 def test_optimised_masses_come_nearer_to_the_support_at_the_same_total(average):
     motion = mf.onto(samples.walk(cycles=1), average.skeleton)
-    kin, soles = mf.forward_kinematics(average.skeleton, motion), sole_boxes(average)
+    kin, soles = kinematics(average.skeleton, motion), sole_boxes(average)
     masses = volume_masses(mass_volumes(average))
     planted = planted_feet(average, motion).feet
     found = optimised_masses(kin, masses, soles, planted)
@@ -366,7 +375,8 @@ def test_optimised_masses_come_nearer_to_the_support_at_the_same_total(average):
 
 def _margin(character, motion, planted, **options):
     masses, soles = mesh_masses(character), sole_boxes(character)
-    return mf.terms.ZmpMargin(masses, soles, planted, **({"threshold": np.zeros(motion.frame_count)} | options))
+    threshold = options.pop("threshold", np.zeros(motion.frame_count))
+    return mf.terms.ZmpMargin(masses, soles, planted, threshold, **options)
 
 
 @pytest.mark.parametrize("pose", ["walk", "bind"])
@@ -382,7 +392,7 @@ def test_zmp_margin_contract(heavy, pose, kind):
     planted = np.tile([True, False], (9, 1))
     planted[4] = [True, True]
     planted[6] = [False, False]
-    kin = mf.forward_kinematics(heavy.skeleton, motion)
+    kin = kinematics(heavy.skeleton, motion)
     own = np.asarray(zmp_distance(kin, mesh_masses(heavy), sole_boxes(heavy), planted).signed)
     # within a hair of the limit, every other frame on this side of it; or far outside
     threshold = own - 1e-4 * np.where(np.arange(9) % 2 == 0, 1.0, -1.0) if kind == "contact" else own - 0.05
@@ -427,21 +437,22 @@ def _slope(problem, x):
 
 def test_zmp_margin_asks_for_nothing_that_the_original_did_not_have(heavy):
     motion = mf.onto(samples.walk(cycles=1), heavy.skeleton)
-    kin, soles = mf.forward_kinematics(heavy.skeleton, motion), sole_boxes(heavy)
+    kin, soles = kinematics(heavy.skeleton, motion), sole_boxes(heavy)
     planted = planted_feet(heavy, motion).feet
     original = zmp_distance(kin, mesh_masses(heavy), soles, planted)
     assert np.asarray(original.outside).max() > 0.003  # a walk leaves its support: thesis 5.6.2
     kept = _margin(heavy, motion, planted, threshold=np.asarray(original.outside))
-    np.testing.assert_allclose(kept.residual(kin), 0.0, atol=1e-9)
+    residual = eqx.filter_jit(lambda term: term.residual(kin))
+    np.testing.assert_allclose(residual(kept), 0.0, atol=1e-9)
     assert not kept.frame_local
     stricter = _margin(heavy, motion, planted, threshold=np.asarray(original.outside), scale=0.5)
-    rows = np.asarray(stricter.residual(kin))
+    rows = np.asarray(residual(stricter))
     assert (rows >= 0).all() and rows.max() > 0.1
 
 
 def test_zmp_margin_does_not_recompile_for_new_numbers(heavy):
     motion = rest_motion(heavy.skeleton)[np.zeros(5, int)]
-    kin, planted, count = mf.forward_kinematics(heavy.skeleton, motion), np.ones((5, 2), bool), []
+    kin, planted, count = kinematics(heavy.skeleton, motion), np.ones((5, 2), bool), []
 
     @jax.jit
     def cost(term):

@@ -31,6 +31,9 @@ from motionfit.dynamics import (
 )
 from motionfit.shape.mass import Masses, mesh_masses
 
+# one program per clip length instead of one per operation
+kinematics = eqx.filter_jit(mf.forward_kinematics)
+
 RATE = 1000.0  # [1/s] so dense that the differences do not matter: their error is some (2 pi f / RATE)^2
 DIFFERENCED = 2e-4  # relative
 
@@ -45,7 +48,7 @@ def _links(angles, lengths, masses, inertias, reaches):
     motion = mf.Motion(skeleton, np.zeros((len(angles), 3)), turns.reshape(*angles.shape, 4), 1 / RATE)
     bodies = Masses(("hips", "chest", "head")[:count], tuple(range(count)), np.array(masses),
                     np.array([[0.0, -r, 0.0] for r in reaches]), np.array([i * np.eye(3) for i in inertias]))  # fmt: skip
-    return skeleton, mf.forward_kinematics(skeleton, motion), bodies
+    return skeleton, kinematics(skeleton, motion), bodies
 
 
 def test_a_pendulum():
@@ -98,7 +101,7 @@ def _waving(seed, joints=6, frames=120):
 def test_power_goes_into_energy(seed):
     """The joints' power and the root's is the rate of kinetic and potential energy: no term may be missing."""
     skeleton, motion, masses = _waving(seed)
-    kin = mf.forward_kinematics(skeleton, motion)
+    kin = kinematics(skeleton, motion)
     loads = inverse_dynamics(skeleton, kin, masses, window=0.0)
     omega = np.asarray(angular_velocities(kin.rotations_world, kin.dt))
     above = np.concatenate([np.zeros_like(omega[:, :1]), omega[:, list(skeleton.parents[1:])]], axis=1)
@@ -118,7 +121,7 @@ def test_power_goes_into_energy(seed):
 
 def test_the_whole_needs_what_its_momentum_needs():
     skeleton, motion, masses = _waving(7)
-    kin = mf.forward_kinematics(skeleton, motion)
+    kin = kinematics(skeleton, motion)
     loads = inverse_dynamics(skeleton, kin, masses, window=0.0)
     com = np.asarray(centre_of_mass(kin, masses))
     acceleration = np.gradient(np.gradient(com, 1 / RATE, axis=0), 1 / RATE, axis=0)[5:-5]
@@ -130,7 +133,7 @@ def test_the_whole_needs_what_its_momentum_needs():
 def test_standing(heavy):
     """At rest the ground carries the weight under the centre of mass, and nothing is left at the root."""
     motion = rest_motion(heavy.skeleton)[np.zeros(6, int)]
-    kin, masses, soles = mf.forward_kinematics(heavy.skeleton, motion), mesh_masses(heavy), sole_boxes(heavy)
+    kin, masses, soles = kinematics(heavy.skeleton, motion), mesh_masses(heavy), sole_boxes(heavy)
     loads = inverse_dynamics(heavy.skeleton, kin, masses, soles, np.ones((6, 2), bool))
     weight = GRAVITY * float(masses.total)
     np.testing.assert_allclose(np.sum(loads.ground_force, axis=1), [[0, weight, 0]] * 6, atol=1e-6)
@@ -162,7 +165,7 @@ def test_standing(heavy):
 def test_the_reaction_acts_at_the_zero_moment_point(average):
     """Found here from the root's wrench, in `balance` from the momenta about the centre of mass."""
     motion = mf.onto(samples.walk(cycles=1), average.skeleton)
-    kin, masses, soles = mf.forward_kinematics(average.skeleton, motion), mesh_masses(average), sole_boxes(average)
+    kin, masses, soles = kinematics(average.skeleton, motion), mesh_masses(average), sole_boxes(average)
     planted = np.tile([True, False], (motion.frame_count, 1))
     # on skis no reaction is outside the support
     soles = eqx.tree_at(lambda s: s.corners_joint, soles, np.asarray(soles.corners_joint) * np.array([60.0, 1.0, 60.0]))
@@ -189,7 +192,7 @@ def test_torques_are_differentiable():
 
     def total(turns):
         turned = mf.Motion(skeleton, motion.root, turns, jnp.asarray(1 / 60))
-        loads = inverse_dynamics(skeleton, mf.forward_kinematics(skeleton, turned), masses)
+        loads = inverse_dynamics(skeleton, kinematics(skeleton, turned), masses)
         return jnp.sum(jnp.sin(0.01 * loads.torque))
 
     turns = jnp.asarray(motion.rotations)
@@ -240,7 +243,7 @@ def test_mujoco_agrees():
     # a ball joint's velocity is in the child's frame, so its rate of change is the acceleration itself
     half = np.stack([velocity(a, b, 1 / RATE) for a, b in zip(qpos, qpos[1:], strict=False)])
     data = mujoco.MjData(model)
-    kin = mf.forward_kinematics(skeleton, motion)
+    kin = kinematics(skeleton, motion)
     loads = inverse_dynamics(skeleton, kin, masses, window=0.0)
     turn = np.asarray(rotation.to_matrix(kin.rotations_world))
     for t in range(10, frames - 10, 9):
@@ -256,7 +259,7 @@ def test_mujoco_agrees():
 def test_newton_euler_carries_a_load_to_the_root():
     """One force at the tip of a chain: every joint feels it, with its own lever."""
     skeleton = mf.Skeleton(["a", "b", "c"], [-1, 0, 1], np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 0]]))
-    kin = mf.forward_kinematics(skeleton, rest_motion(skeleton))
+    kin = kinematics(skeleton, rest_motion(skeleton))
     forces = jnp.zeros((1, 3, 3)).at[0, 2].set(jnp.array([0.0, 5.0, 0.0]))
     force, torque = newton_euler(skeleton, kin.positions_world, forces, jnp.zeros((1, 3, 3)))
     np.testing.assert_allclose(force[0], [[0, 5, 0]] * 3)
@@ -294,7 +297,7 @@ def test_a_crouch_strains_the_knees_and_a_lean_the_ankles(average):
     masses, soles, both = mesh_masses(average), sole_boxes(average), np.ones((5, 2), bool)
 
     def actions(m):
-        kin = mf.forward_kinematics(skeleton, m)
+        kin = kinematics(skeleton, m)
         ground = float(np.asarray(soles.corners_world(kin))[..., 1].min())
         loads = inverse_dynamics(skeleton, kin, masses, soles, both, ground=ground)
         return {k: float(v[2]) for k, v in joint_actions(skeleton, kin, loads).items()}
@@ -309,19 +312,19 @@ def test_a_walk_is_feasible_and_the_same_walk_four_times_as_fast_is_not(average)
     motion = mf.onto(samples.walk(cycles=2), average.skeleton)
     masses = mesh_masses(average)
     soles, planted, ground = planted_feet(average, motion)
-    kin = mf.forward_kinematics(average.skeleton, motion)
+    kin = kinematics(average.skeleton, motion)
     found = feasibility(average.skeleton, kin, masses, soles, planted, 1.75, ground=ground)
     assert found.feasible, found.report()
     assert found.residual is not None and found.residual < 0.05
     fast = mf.Motion(motion.skeleton, motion.root, motion.rotations, float(motion.dt) / 4)
-    kin = mf.forward_kinematics(average.skeleton, fast)
+    kin = kinematics(average.skeleton, fast)
     strained = feasibility(average.skeleton, kin, masses, soles, planted, 1.75, ground=ground)
     assert not strained.feasible and "not feasible" in strained.report()
     assert all(np.isfinite(v) for v in [*strained.peak.values(), *strained.limit.values()])
 
 
 def test_required_is_the_weight_at_rest(average):
-    kin = mf.forward_kinematics(average.skeleton, rest_motion(average.skeleton)[np.zeros(4, int)])
+    kin = kinematics(average.skeleton, rest_motion(average.skeleton)[np.zeros(4, int)])
     masses = mesh_masses(average)
     force, _ = required(kin, masses)
     np.testing.assert_allclose(np.sum(force, axis=1), [[0, GRAVITY * float(masses.total), 0]] * 4, atol=1e-6)

@@ -5,6 +5,7 @@ import pathlib
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import numpy as np
 
 import motionfit as mf
@@ -55,6 +56,10 @@ def clips(options: argparse.Namespace) -> dict[str, mf.Motion]:
     if options.data is None:
         return {"Normal walk": samples.walk(frame_rate=options.fps)}
     return {k: mf.load_motion(options.data / f"{v}.bvh", fps=options.fps) for k, v in CLIPS.items()}
+
+
+# one program per clip length instead of one per operation
+kinematics = eqx.filter_jit(mf.forward_kinematics)
 
 
 class Planted(NamedTuple):

@@ -15,6 +15,7 @@ from benchmarks.thesis._setting import (
     arguments,
     bodies,
     clips,
+    kinematics,
     planted_feet,
     save_figure,
     table,
@@ -52,7 +53,7 @@ def main() -> None:
     for clip_name, clip in clips(options).items():
         motion = mf.onto(clip, character.skeleton)
         soles, feet, ground = planted_feet(character, motion)
-        kin = mf.forward_kinematics(character.skeleton, motion)
+        kin = kinematics(character.skeleton, motion)
         found[clip_name] = optimised_masses(kin, start, soles, feet, ground=ground).limbs()
     rows = [[LIMB_NAMES[limb], *(1e3 * m[limb] for m in found.values())] for limb in LIMBS]
     table(f"Tables F.1 and F.2, {name}: optimised masses [g]", ["limb", *found], rows, options.out, "table_F_1_F_2")

@@ -7,7 +7,7 @@ import numpy as np
 
 import motionfit as mf
 from benchmarks.thesis import _printed as printed
-from benchmarks.thesis._setting import arguments, bodies, clips, planted_feet, save_figure, table, truth
+from benchmarks.thesis._setting import arguments, bodies, clips, kinematics, planted_feet, save_figure, table, truth
 from motionfit.balance import balance_measures, zmp_distance
 
 
@@ -22,7 +22,7 @@ def main() -> None:
         for name, clip in motions.items():
             motion = mf.onto(clip, character.skeleton)
             soles, feet, ground = planted_feet(character, motion)
-            kin = mf.forward_kinematics(character.skeleton, motion)
+            kin = kinematics(character.skeleton, motion)
             distance = zmp_distance(kin, masses, soles, feet, ground=ground)
             found[body][name] = balance_measures(distance)
             series.setdefault(name, np.where(distance.supported, 100 * np.asarray(distance.outside), np.nan))

@@ -11,7 +11,17 @@ import numpy as np
 
 import motionfit as mf
 from benchmarks.thesis import _printed as printed
-from benchmarks.thesis._setting import MODELS, arguments, bodies, clips, planted_feet, save_figure, table, truth
+from benchmarks.thesis._setting import (
+    MODELS,
+    arguments,
+    bodies,
+    clips,
+    kinematics,
+    planted_feet,
+    save_figure,
+    table,
+    truth,
+)
 from motionfit.balance import optimised_masses, support_polygon, zero_moment_point, zmp_distance
 from motionfit.shape.mass import RADIUS_SCALES, mass_volumes, volume_masses
 
@@ -28,7 +38,7 @@ def main() -> None:
         for name, clip in motions.items():
             motion = mf.onto(clip, character.skeleton)
             soles, feet, ground = planted_feet(character, motion)
-            kin = mf.forward_kinematics(character.skeleton, motion)
+            kin = kinematics(character.skeleton, motion)
             counted = np.asarray(zmp_distance(kin, true, soles, feet, ground=ground).supported)
             paths = {"truth": zero_moment_point(kin, true, ground=ground)}
             optimised = optimised_masses(kin, models["cylinders"], soles, feet, ground=ground)

@@ -30,7 +30,7 @@ DENSITY: dict[str, float] = {
 }  # fmt: skip
 
 # The limbs of tables 5.1 to 5.5.
-LIMBS = ("head", "right_arm", "left_arm", "trunk", "left_leg", "right_leg")
+LIMBS: tuple[str, ...] = ("head", "right_arm", "left_arm", "trunk", "left_leg", "right_leg")
 
 # Thesis table 5.5: what the radii of each limb's volumes are multiplied by, so that the shares of the total mass are
 # those measured on its subject. The mass goes with the square (checked against table 5.2, ellipsoids included): the

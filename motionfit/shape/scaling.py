@@ -32,7 +32,7 @@ MEASURES: dict[str, tuple[str, ...]] = {
     "waist_height": ("pelvis", "thigh", "calf"),
     "back": ("spine",),
 }
-SEGMENTS = ("clavicle", "upper_arm", "forearm", "pelvis", "thigh", "calf", "spine")
+SEGMENTS: tuple[str, ...] = ("clavicle", "upper_arm", "forearm", "pelvis", "thigh", "calf", "spine")
 
 
 def segment_scales(skeleton: Skeleton, measures: Mapping[str, float]) -> dict[str, float]:
