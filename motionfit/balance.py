@@ -97,7 +97,7 @@ def centres_world(kin: Kinematics, masses: Masses) -> Float[Array, "frames segme
     """Centre of mass [m] of every segment."""
     joints = np.array(masses.joints)
     local = jnp.asarray(masses.centre_joint).astype(kin.rotations_world.dtype)
-    return kin.positions_world[:, joints] + rotation.rotate(kin.rotations_world[:, joints], local[None])
+    return jnp.asarray(kin.positions_world)[:, joints] + rotation.rotate(kin.rotations_world[:, joints], local[None])
 
 
 def _shares(masses: Masses, dtype) -> Float[Array, " segments"]:
@@ -190,7 +190,7 @@ class Soles(eqx.Module):
         joints = np.array(self.joints)
         turn = kin.rotations_world[:, joints][:, :, None]
         local = jnp.asarray(self.corners_joint).astype(turn.dtype)
-        return kin.positions_world[:, joints][:, :, None] + rotation.rotate(turn, local[None])
+        return jnp.asarray(kin.positions_world)[:, joints][:, :, None] + rotation.rotate(turn, local[None])
 
 
 def sole_boxes(character: Character, thickness: float = 0.03) -> Soles:
@@ -285,13 +285,16 @@ def support_polygon(corners: Float[AnyArray, "corners 2"]) -> Float[np.ndarray, 
 
 def support_distance(
     point_world: Float[AnyArray, "frames 3"], corners_world: Float[AnyArray, "frames feet 4 3"],
-    planted: Bool[AnyArray, "frames feet"],
+    planted: Bool[AnyArray, "_ _"],
 ) -> Float[Array, " frames"]:  # fmt: skip
     """Signed horizontal distance [m] from the support polygon, the hull of the planted soles: positive outside.
 
     Frames without a planted foot have no support: 0, and to be left out.
     """
-    frames = planted.shape[0]
+    frames = point_world.shape[0]
+    if planted.shape != (frames, corners_world.shape[1]):
+        raise InputError(f"planted has shape {planted.shape}; it says for each of {frames} frames whether the left and "
+                         f"the right foot is down: ({frames}, {corners_world.shape[1]})")  # fmt: skip
     corners = jnp.asarray(corners_world).reshape(frames, -1, 3)[..., np.array([0, 2])]
     present = jnp.repeat(jnp.asarray(planted), 4, axis=1)
     return hull_distance(jnp.asarray(point_world)[:, np.array([0, 2])], corners, present)

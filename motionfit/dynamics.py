@@ -111,7 +111,7 @@ def inverse_dynamics(
     their soles' centres, each at its own centre shifted alike, which gives the same total force and moment. Without a
     planted foot, or in flight, there is no reaction, and all of it is missing at the root.
     """
-    positions = kin.positions_world
+    positions = jnp.asarray(kin.positions_world)
     forces, moments = required(kin, masses, window)
     total, about_root = (x[:, 0] for x in newton_euler(skeleton, positions, forces, moments))
     frames = positions.shape[0]
@@ -125,7 +125,7 @@ def inverse_dynamics(
     drop = jnp.asarray(ground, positions.dtype) - positions[:, 0, 1]
     arm_x = (about_root[:, 2] + drop * total[:, 0]) / vertical
     arm_z = (drop * total[:, 2] - about_root[:, 0]) / vertical
-    point = positions[:, 0] + jnp.stack([arm_x, drop, arm_z], axis=-1)
+    point: Array = positions[:, 0] + jnp.stack([arm_x, drop, arm_z], axis=-1)
     twist = about_root[:, 1] - (arm_z * total[:, 0] - arm_x * total[:, 2])
     down = jnp.asarray(planted)
     plane = np.array([0, 2])

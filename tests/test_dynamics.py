@@ -81,14 +81,14 @@ def test_a_double_pendulum():
         np.testing.assert_allclose(loads.torque[3:-3, joint, 2], expected[3:-3], atol=DIFFERENCED * scale)
 
 
-def _waving(seed, joints=6, frames=120):
+def _waving(seed, joints=6, frames=120, size=0.6):
     rng = np.random.default_rng(seed)
     parents = [-1] + [int(rng.integers(0, j)) for j in range(1, joints)]
     skeleton = mf.Skeleton([f"joint{j}" for j in range(joints)], parents, 0.3 * rng.normal(size=(joints, 3)))
     t = np.arange(frames) / RATE
     waves = np.sin(2 * np.pi * np.outer(t, rng.uniform(0.5, 1.5, 3 + 3 * joints)) + rng.uniform(0, 6, 3 + 3 * joints))
-    turns = Rotation.from_rotvec(0.6 * waves[:, 3:].reshape(-1, 3)).as_quat(scalar_first=True)
-    motion = mf.Motion(skeleton, 0.2 * waves[:, :3] + [0, 1, 0], turns.reshape(frames, joints, 4), 1 / RATE)
+    turns = Rotation.from_rotvec(size * waves[:, 3:].reshape(-1, 3)).as_quat(scalar_first=True)
+    motion = mf.Motion(skeleton, size / 3 * waves[:, :3] + [0, 1, 0], turns.reshape(frames, joints, 4), 1 / RATE)
     # from second moments, so that no moment of inertia is above the sum of the other two
     moments = [x @ x.T + 0.01 * np.eye(3) for x in 0.1 * rng.normal(size=(joints, 3, 3))]
     inertia = np.stack([np.trace(c) * np.eye(3) - c for c in moments])
@@ -206,7 +206,7 @@ def test_torques_are_differentiable():
 def test_mujoco_agrees():
     """The generalised forces of mj_inverse, for a tree of ball joints on a free root."""
     mujoco = pytest.importorskip("mujoco")
-    skeleton, motion, masses = _waving(4)
+    skeleton, motion, masses = _waving(4, size=0.3)
     frames, joints = motion.rotations.shape[:2]
 
     def body(j: int) -> str:
@@ -245,6 +245,7 @@ def test_mujoco_agrees():
     data = mujoco.MjData(model)
     kin = kinematics(skeleton, motion)
     loads = inverse_dynamics(skeleton, kin, masses, window=0.0)
+    zmp = zero_moment_point(kin, masses, window=0.0)
     turn = np.asarray(rotation.to_matrix(kin.rotations_world))
     for t in range(10, frames - 10, 9):
         data.qpos[:], data.qvel[:] = qpos[t], (half[t - 1] + half[t]) / 2
@@ -253,6 +254,13 @@ def test_mujoco_agrees():
         own = np.concatenate([np.asarray(loads.force)[t, 0], turn[t, 0].T @ np.asarray(loads.torque)[t, 0]])
         own = np.concatenate([own, *(turn[t, j].T @ np.asarray(loads.torque)[t, j] for j in order[1:])])
         np.testing.assert_allclose(own, data.qfrc_inverse, atol=1e-3 * np.abs(data.qfrc_inverse).max())
+        # where a contact that carries the root's whole wrench has no horizontal moment
+        force, moment = data.qfrc_inverse[:3], turn[t, 0] @ data.qfrc_inverse[3:6]
+        assert zmp.load[t] == pytest.approx(force[1] / (GRAVITY * float(masses.total)), abs=1e-3)
+        if zmp.load[t] > 0.3:
+            x, y, z = np.asarray(motion.root)[t]
+            there = [x + (moment[2] - y * force[0]) / force[1], z - (moment[0] + y * force[2]) / force[1]]
+            np.testing.assert_allclose(np.asarray(zmp.point_world)[t, [0, 2]], there, atol=2e-3)
     assert joints == model.nbody - 1
 
 

@@ -49,7 +49,7 @@ def test_solids_weigh_what_their_meshes_weigh(kind):
     mesh.apply_translation(-mesh.center_mass)
     turn, centre = Rotation.from_rotvec([0.3, -0.8, 0.5]), np.array([0.1, 0.2, -0.3])
     ends = [centre + turn.apply([0, 0, s * half]) for s in (-1, 1)]
-    masses = volume_masses(_volumes(kind, *ends, (radius, radius), half))
+    masses = volume_masses(_volumes(kind, ends[0], ends[1], (radius, radius), half))
     density = density_of("left_thigh")
     np.testing.assert_allclose(masses.mass, density * mesh.volume, rtol=FACETED)
     np.testing.assert_allclose(masses.centre_joint[0], centre, atol=1e-12)

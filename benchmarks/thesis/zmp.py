@@ -54,7 +54,9 @@ def main() -> None:
 
     kinds = list(next(iter(next(iter(errors.values())).values())))
     for body, found in errors.items():
-        rows = [[name, *(f"{e[k].mean():.2f} ({e[k].std():.2f})" for k in kinds)] for name, e in found.items()]
+        rows: list[list] = [
+            [name, *(f"{e[k].mean():.2f} ({e[k].std():.2f})" for k in kinds)] for name, e in found.items()
+        ]
         rows.append(["mean", *(float(np.mean([e[k].mean() for e in found.values()])) for k in kinds)])
         table(
             f"Table F.3, {body}: distance from the true ZMP [cm] (SD)",
