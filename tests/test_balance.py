@@ -475,3 +475,12 @@ def test_zmp_margin_does_not_recompile_for_new_numbers(heavy):
     for scale, sigma in ((1.0, 0.01), (0.9, 0.02), (0.5, 0.03)):
         cost(_margin(heavy, motion, planted, scale=scale, sigma=sigma))
     assert len(count) == 1
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3])
+def test_the_shortest_clips(heavy, frames):
+    motion = rest_motion(heavy.skeleton)[np.zeros(frames, int)]
+    distance = zmp_distance(
+        kinematics(heavy.skeleton, motion), mesh_masses(heavy), sole_boxes(heavy), np.ones((frames, 2), bool)
+    )
+    assert np.isfinite(distance.signed).all() and np.asarray(distance.supported).all()

@@ -2,7 +2,8 @@
 
 LIMBS = ("head", "right_arm", "left_arm", "trunk", "left_leg", "right_leg")
 
-# Tables 5.1 [g] and 5.2 [%], in the order of LIMBS.
+# Tables 5.1 [g] and 5.2 [%], in the order of LIMBS. Erratum: the measured share of the right arm is printed as 7.75; by
+# table 5.1 it is 4846 / 63982 = 7.57, with which the column adds up to 100 and table 5.5 follows.
 MASS = {
     "cylinders": (5043, 3981, 4325, 19772, 8027, 8077),
     "ellipsoids": (2498, 1340, 1393, 18794, 4579, 3995),
@@ -11,7 +12,7 @@ MASS = {
 SHARE = {
     "cylinders": (10.25, 8.09, 8.79, 40.17, 16.31, 16.41),
     "ellipsoids": (7.66, 4.11, 4.27, 57.65, 14.05, 12.26),
-    "measured": (7.33, 7.75, 7.14, 46.82, 15.26, 15.87),
+    "measured": (7.33, 7.57, 7.14, 46.82, 15.26, 15.87),
 }
 # Table 5.3 [g]: mean and sample standard deviation over the eight motions of F.1 and F.2. Erratum: the right leg of
 # the jumps in F.2 is printed as 5383, the value of the fast walk beside it; with 24770 the jumps' masses add up to the
