@@ -145,7 +145,11 @@ class Zmp(eqx.Module):
     load: Float[AnyArray, " frames"]
 
 
-@eqx.filter_jit
+def _number(x) -> Array:
+    """A Python number would be static under jit, and each new one would compile again."""
+    return jnp.asarray(x, dtype=float)
+
+
 def zero_moment_point(
     kin: Kinematics,
     masses: Masses,
@@ -165,6 +169,11 @@ def zero_moment_point(
     In flight the denominator vanishes: it is held above `FLIGHT` g, so that nothing is infinite; `load` tells those
     frames, and every measure here leaves them out.
     """
+    return _zero_moment_point(kin, masses, _number(ground), _number(window), spin)
+
+
+@eqx.filter_jit
+def _zero_moment_point(kin, masses, ground, window, spin: bool) -> Zmp:
     com, _, acceleration = smooth_derivatives(centre_of_mass(kin, masses), kin.dt, window)
     total = jnp.sum(jnp.asarray(masses.mass)).astype(com.dtype)
     _, moment, _ = smooth_derivatives(angular_momentum(kin, masses, spin) / total, kin.dt, window)
@@ -313,7 +322,6 @@ class ZmpDistance(eqx.Module):
         return jnp.where(self.supported, jnp.maximum(self.signed, 0.0), 0.0)
 
 
-@eqx.filter_jit
 def zmp_distance(
     kin: Kinematics,
     masses: Masses,
@@ -328,7 +336,12 @@ def zmp_distance(
 
     Of the original motion on the original body its `outside` are the thresholds zmp_i of thesis 4.7.2.
     """
-    zmp = zero_moment_point(kin, masses, spin=spin, ground=ground, window=window)
+    return _zmp_distance(kin, masses, soles, planted, _number(ground), _number(window), spin)
+
+
+@eqx.filter_jit
+def _zmp_distance(kin, masses, soles, planted, ground, window, spin: bool) -> ZmpDistance:
+    zmp = _zero_moment_point(kin, masses, ground, window, spin)
     signed = support_distance(zmp.point_world, soles.corners_world(kin), planted)
     return ZmpDistance(signed, jnp.any(jnp.asarray(planted), axis=1) & (zmp.load > FLIGHT))
 
@@ -357,7 +370,7 @@ def balance_measures(distance: ZmpDistance, reference: ZmpDistance | None = None
 
 
 def optimised_masses(
-    kin: Kinematics, masses: Masses, soles: Soles, planted: Bool[AnyArray, "frames feet"], **options
+    kin: Kinematics, masses: Masses, soles: Soles, planted: Bool[AnyArray, "frames feet"], **options: float
 ) -> Masses:
     """Limb masses that bring the ZMP as near to the support as they can: [SKG03] as thesis 5.6 tried it.
 
@@ -372,20 +385,11 @@ def optimised_masses(
     if shares.min() <= 0:
         raise InputError(f"no mass on the {LIMBS[int(shares.argmin())]}: nothing to share out there")
     limb = np.array([LIMBS.index(limb_of(role)) for role in masses.roles])
-
-    @jax.jit
-    def cost(x):
-        factor = (x / (shares / shares.sum()))[limb]
-        scaled = Masses(masses.roles, masses.joints, jnp.asarray(masses.mass) * factor,
-                        masses.centre_joint, masses.inertia_joint)  # fmt: skip
-        distance = zmp_distance(kin, scaled, soles, planted, spin=False, **options)
-        # centimetres: SLSQP's stopping rule is absolute
-        return 1e4 * jnp.sum(distance.outside**2) / jnp.maximum(jnp.sum(jnp.where(distance.supported, 1.0, 0.0)), 1.0)
-
-    value_and_gradient = jax.jit(jax.value_and_grad(cost))
+    numbers = {"ground": 0.0, "window": WINDOW} | options
+    setting = (kin, masses, soles, planted, shares / shares.sum(), limb, *(_number(numbers[k]) for k in numbers))
 
     def host(x):
-        value, gradient = value_and_gradient(jnp.asarray(x))
+        value, gradient = _imbalance(jnp.asarray(x), *setting)
         return float(value), np.asarray(gradient, float)
 
     found = minimize(
@@ -395,3 +399,14 @@ def optimised_masses(
     )  # fmt: skip
     best = np.clip(found.x if np.isfinite(found.x).all() else shares / shares.sum(), 0.0, None)
     return masses.with_limbs(dict(zip(LIMBS, best / best.sum() * shares.sum(), strict=True)))
+
+
+@eqx.filter_jit
+@eqx.filter_value_and_grad
+def _imbalance(x, kin, masses, soles, planted, shares, limb, ground, window):
+    """Mean squared distance [cm^2] of the point masses' ZMP from its support, for limb shares x: SLSQP's stopping rule
+    is absolute, hence the centimetres."""
+    mass = jnp.asarray(masses.mass) * (x / shares)[limb]
+    scaled = Masses(masses.roles, masses.joints, mass, masses.centre_joint, masses.inertia_joint)
+    distance = _zmp_distance(kin, scaled, soles, planted, ground, window, False)
+    return 1e4 * jnp.sum(distance.outside**2) / jnp.maximum(jnp.sum(jnp.where(distance.supported, 1.0, 0.0)), 1.0)

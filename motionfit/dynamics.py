@@ -92,7 +92,6 @@ def required(
     return empty.at[:, joints].add(force), empty.at[:, joints].add(moment)
 
 
-@eqx.filter_jit
 def inverse_dynamics(
     skeleton: Skeleton,
     kin: Kinematics,
@@ -111,6 +110,13 @@ def inverse_dynamics(
     their soles' centres, each at its own centre shifted alike, which gives the same total force and moment. Without a
     planted foot, or in flight, there is no reaction, and all of it is missing at the root.
     """
+    # as arrays: Python numbers would be static under jit, and each new one would compile again
+    numbers = jnp.asarray(ground, dtype=float), jnp.asarray(window, dtype=float)
+    return _inverse_dynamics(skeleton, kin, masses, soles, planted, *numbers)
+
+
+@eqx.filter_jit
+def _inverse_dynamics(skeleton: Skeleton, kin: Kinematics, masses: Masses, soles, planted, ground, window) -> Loads:
     positions = jnp.asarray(kin.positions_world)
     forces, moments = required(kin, masses, window)
     total, about_root = (x[:, 0] for x in newton_euler(skeleton, positions, forces, moments))

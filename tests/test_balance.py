@@ -246,6 +246,24 @@ def test_single_precision_agrees(heavy):
         zmp_distance(kin, masses, soles, planted[:5])
 
 
+def test_new_numbers_do_not_compile_again(average, monkeypatch):
+    motion = rest_motion(average.skeleton)[np.zeros(23, int)]
+    kin, masses, soles = kinematics(average.skeleton, motion), mesh_masses(average), sole_boxes(average)
+    traced = []
+
+    def counted(*arguments):
+        traced.append(1)
+        return smooth_derivatives(*arguments)
+
+    monkeypatch.setattr("motionfit.balance.smooth_derivatives", counted)
+    for ground, window in ((0.0, 0.03), (0.01, 0.03), (0.02, 0.05)):
+        zero_moment_point(kin, masses, ground=ground, window=window)
+        zmp_distance(kin, masses, soles, np.ones((23, 2), bool), ground=ground, window=window)
+        if ground == 0.0:
+            first = len(traced)
+    assert first > 0 and len(traced) == first
+
+
 # --- support ------------------------------------------------------------------------------------------------------
 
 
