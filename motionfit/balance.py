@@ -348,8 +348,8 @@ def _zmp_distance(kin, masses, soles, planted, ground, window, spin: bool) -> Zm
 
 def balance_measures(distance: ZmpDistance, reference: ZmpDistance | None = None) -> dict:
     """report.json's balance entry, over the supported frames: mean and standard deviation of the ZMP's distance from
-    its support [m], the mean of what goes beyond the reference's distance in the same frame [m], and the share of
-    frames that are supported. None where nothing is supported, or there is no reference."""
+    its support [m], the mean of what goes beyond the reference's distance in the same frame [m], and how many
+    frames are supported. None where nothing is supported, or there is no reference."""
     supported = np.asarray(distance.supported)
     outside = np.asarray(distance.outside, float)
     result: dict = dict.fromkeys(("zmp_distance_mean_m", "zmp_distance_sd_m", "excess_over_reference_mean_m"))
@@ -363,7 +363,7 @@ def balance_measures(distance: ZmpDistance, reference: ZmpDistance | None = None
         if both.any():
             excess = outside[both] - np.asarray(reference.outside, float)[both]
             result["excess_over_reference_mean_m"] = float(np.maximum(excess, 0.0).mean())
-    return result | {"supported_frames": float(supported.mean()) if len(supported) else 0.0}
+    return result | {"supported_frames": int(supported.sum())}
 
 
 # --- masses that make the motion look balanced --------------------------------------------------------------------

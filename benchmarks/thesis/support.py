@@ -24,7 +24,7 @@ def main() -> None:
             soles, feet, ground = planted_feet(character, motion)
             kin = kinematics(character.skeleton, motion)
             distance = zmp_distance(kin, masses, soles, feet, ground=ground)
-            found[body][name] = balance_measures(distance)
+            found[body][name] = balance_measures(distance) | {"frames": motion.frame_count}
             series.setdefault(name, np.where(distance.supported, 100 * np.asarray(distance.outside), np.nan))
 
     def cell(m: dict) -> str:
@@ -41,7 +41,7 @@ def main() -> None:
     rows.append(
         [
             "supported frames, %",
-            *(100 * float(np.mean([m["supported_frames"] for m in found[b].values()])) for b in found),
+            *(100 * float(np.mean([m["supported_frames"] / m["frames"] for m in found[b].values()])) for b in found),
             None,
         ]
     )
