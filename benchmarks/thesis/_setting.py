@@ -23,7 +23,7 @@ CLIPS: dict[str, str] = {
     "Skip": "bvh/131_03_start_hop_stop",
 }  # fmt: skip
 BODIES = ("avg_male", "thin_male", "tall_male", "heavy_male", "avg_female", "short_female")
-BUILTIN_BODIES = ("average", "heavy", "thin")
+BUILTIN_BODIES = ("average", "heavy", "slim")
 LIMB_NAMES = {"head": "Head", "right_arm": "Right Arm", "left_arm": "Left Arm", "trunk": "Trunk",
               "left_leg": "Left Leg", "right_leg": "Right Leg"}  # fmt: skip
 

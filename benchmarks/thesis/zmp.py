@@ -99,7 +99,7 @@ def main() -> None:
             path = np.where(counted[:, None], points[label], np.nan)
             axes.plot(path[:, 1], path[:, 0], color=colour, label=label)
         axes.set(xlabel="z [m]", ylabel="x [m]", aspect="equal")
-        axes.legend()
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.4), ncols=4)
 
     assert first is not None
     save_figure(options.out / "figure_5_18.png", f"Zero-moment point, {first[1]} on {first[0]}", draw)
