@@ -8,7 +8,7 @@ mf.save("adapted.glb", fit.motion, mf.load_character("heavy.glb"))
 
 __version__ = "0.1.0"
 
-from motionfit import adapt, feet, ik, metrics, shape, terms
+from motionfit import adapt, balance, dynamics, feet, ik, metrics, shape, terms
 from motionfit import rotation as rotation
 from motionfit import splines as splines
 from motionfit._character import Character as Character
@@ -43,7 +43,7 @@ from motionfit.metrics import measure as measure
 
 __all__ = [
     "Block", "Character", "Control", "Correction", "Custom", "Drive", "During", "Energy", "Fit", "InputError",
-    "Kinematics", "Motion", "Problem", "Robust", "Skeleton", "Skin", "Term", "adapt", "detect_footplants", "feet", "fit",
-    "forward_kinematics", "ik", "load_character", "load_correction", "load_motion", "measure", "metrics", "onto",
-    "remove_footskate", "resample", "rotation", "save", "shape", "skin", "splines", "terms",
+    "Kinematics", "Motion", "Problem", "Robust", "Skeleton", "Skin", "Term", "adapt", "balance", "detect_footplants",
+    "dynamics", "feet", "fit", "forward_kinematics", "ik", "load_character", "load_correction", "load_motion", "measure",
+    "metrics", "onto", "remove_footskate", "resample", "rotation", "save", "shape", "skin", "splines", "terms",
 ]  # fmt: skip

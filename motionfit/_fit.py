@@ -329,7 +329,9 @@ def block_work(problem: Problem, block: Block, points: tuple[Array, ...]) -> Wor
     objective = problem.objective(block.terms)
     free = [k for k, c in enumerate(problem.controls) if c.name in block.controls]
     free.sort(key=lambda k: block.controls.index(problem.controls[k].name))
-    return Work(objective, tuple(objective.controls[k] for k in free), np.array(free), tuple(points[k] for k in free), points)
+    return Work(
+        objective, tuple(objective.controls[k] for k in free), np.array(free), tuple(points[k] for k in free), points
+    )
 
 
 def settle(

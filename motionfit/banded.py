@@ -122,9 +122,7 @@ class Banded(lx.AbstractLinearSolver):
         squares = squares.reshape(-1, width, controls, width, controls)
         band = []
         for i in range(width):  # the blocks that couple a control point with the i-th after it
-            shifted = [
-                jnp.pad(squares[:, p, :, p + i, :], ((p, 0), (0, 0), (0, 0)))[:points] for p in range(width - i)
-            ]
+            shifted = [jnp.pad(squares[:, p, :, p + i, :], ((p, 0), (0, 0), (0, 0)))[:points] for p in range(width - i)]
             band.append(sum(shifted))
         if damping:
             # each damping row is one control point's own: its square lies on the diagonal
@@ -140,7 +138,9 @@ class Banded(lx.AbstractLinearSolver):
         band = []
         for i in range(self.width):
             colour = (np.arange(points) + i) % period
-            block = jnp.take_along_axis(rows, jnp.asarray(colour)[None, None, :, None], axis=1)[:, 0]  # (column c, point, row c)
+            block = jnp.take_along_axis(rows, jnp.asarray(colour)[None, None, :, None], axis=1)[
+                :, 0
+            ]  # (column c, point, row c)
             exists = (np.arange(points) + i < points)[:, None, None]
             band.append(jnp.where(exists, jnp.transpose(block, (1, 2, 0)), 0.0))
         return jnp.stack(band, axis=1)

@@ -89,9 +89,7 @@ def reaching(average):
     motion = rest_motion(average.skeleton)[np.zeros(50, int)]
     basis = bspline_basis(50, float(motion.dt), 0.1)
     joint = average.skeleton.joint("left_upper_arm")
-    controls = tuple(
-        mf.Control(f"turn{k}", (mf.Drive(joint, np.eye(3)[k], 1.0),), basis, -1.2, 1.2) for k in range(3)
-    )
+    controls = tuple(mf.Control(f"turn{k}", (mf.Drive(joint, np.eye(3)[k], 1.0),), basis, -1.2, 1.2) for k in range(3))
     hand = average.skeleton.joint("left_hand")
     base = mf.forward_kinematics(average.skeleton, motion).positions_world[:, hand, None]
     target = base + 0.2 * jnp.sin(jnp.linspace(0, 6, 50))[:, None, None] * jnp.array([0.3, 1.0, 0.5])
@@ -121,7 +119,9 @@ def test_float32_agrees_with_float64(reaching):
     problem, block = reaching
     double = mf.fit(problem, (block,)).correction.signals()
     with jax.enable_x64(False):
-        single = jax.tree.map(lambda x: np.asarray(x, np.float32) if getattr(x, "dtype", None) == np.float64 else x, problem)
+        single = jax.tree.map(
+            lambda x: np.asarray(x, np.float32) if getattr(x, "dtype", None) == np.float64 else x, problem
+        )
         signals = mf.fit(single, (block,)).correction.signals()
         assert signals.dtype == jnp.float32
     assert np.abs(np.asarray(signals, float) - np.asarray(double)).max() < np.deg2rad(0.1)

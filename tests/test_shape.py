@@ -121,7 +121,9 @@ def test_lookups_have_the_gradient_that_differences_show(heavy, rng):
     gradient = jax.grad(total)(jnp.asarray(points))
     np.testing.assert_allclose(gradient, central_difference(jax.jit(total), points), atol=1e-5)
     tables = jnp.asarray(field.coefficients)
-    along = jax.jvp(lambda c: eqx.tree_at(lambda f: f.coefficients, field, c).depth_home(list(points.T)), (tables,), (tables,))
+    along = jax.jvp(
+        lambda c: eqx.tree_at(lambda f: f.coefficients, field, c).depth_home(list(points.T)), (tables,), (tables,)
+    )
     np.testing.assert_allclose(*along, atol=1e-12)  # linear in the table, inside the grid
 
 

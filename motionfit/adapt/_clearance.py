@@ -170,7 +170,9 @@ def _over_time(look, term: Term, motion: Motion, allowed: Float[Array, "frames r
     order = jnp.minimum(jnp.arange(pieces * size), frames - 1).reshape(pieces, size)
 
     def at(some):
-        part = jax.tree.map(lambda x: jnp.asarray(x)[some], (motion.root, motion.rotations, motion.translations, allowed))
+        part = jax.tree.map(
+            lambda x: jnp.asarray(x)[some], (motion.root, motion.rotations, motion.translations, allowed)
+        )
         chunk = Motion(motion.skeleton, part[0], part[1], motion.dt, part[2])
         return look(term, forward_kinematics(motion.skeleton, chunk), part[3])
 

@@ -95,6 +95,8 @@ class SkinLooks:
             more = np.clip(np.where(seen > 0, over - shown, 0.0), 0.0, LOOK_STEP)
         else:
             down = allowed - shown + np.clip(over, 0.0, LOOK_STEP)
-            more = np.where((seen > 0) & (over > ENOUGH * TOLERANCE), np.maximum(down, before[self.at]), before[self.at])
+            more = np.where(
+                (seen > 0) & (over > ENOUGH * TOLERANCE), np.maximum(down, before[self.at]), before[self.at]
+            )
         after = np.searchsorted(self.at, self.frames)
         return np.maximum(more[after], more[np.maximum(after - 1, 0)])

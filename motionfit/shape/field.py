@@ -399,7 +399,9 @@ def sample_vertices(
     points, known = np.asarray(character.skin.vertices_bind, float)[among], list(apart_from)
     distance = np.full(len(points), np.inf)
     for vertex in known:
-        distance = np.minimum(distance, ((points - np.asarray(character.skin.vertices_bind, float)[vertex]) ** 2).sum(-1))
+        distance = np.minimum(
+            distance, ((points - np.asarray(character.skin.vertices_bind, float)[vertex]) ** 2).sum(-1)
+        )
     chosen = [int(distance.argmax()) if known else int(np.argmin(points @ np.array([0.3, 1.0, 0.2])))]
     for _ in range(min(count, len(points)) - 1):
         distance = np.minimum(distance, ((points - points[chosen[-1]]) ** 2).sum(-1))
