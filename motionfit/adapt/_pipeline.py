@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
 
 from motionfit._character import Character
@@ -54,6 +54,7 @@ class Stage(NamedTuple):
     clearance: Clearance
     columns: list[int]
     allowed: Float[np.ndarray, "frames pairs"]
+    quiet: Bool[np.ndarray, " pairs"]
 
 
 class Seen(NamedTuple):
@@ -123,12 +124,18 @@ def adapt(
     kept = np.where([p.adjacent for p in pairs], kept, np.minimum(kept, ENOUGH * TOLERANCE))
     allowed = np.where(quiet, np.maximum(before, own), kept)
 
-    stages = _stages(character, blocks, pairs, objective, allowed)
+    stages = _stages(character, blocks, pairs, objective, allowed, quiet)
     smooth, history, correction, moved = _jerk_scale(base), [], Correction.zero(seen.controls), small
+    steps = sweeps * len(stages)
+
+    def told(round_: int):
+        if progress is None:
+            return None
+        return lambda name, done, _: progress(name, round_ * steps + done, ROUNDS * steps)
+
     for round_ in range(ROUNDS):
         problem = _problem(character, seen, stages, beyond, smooth, (small, moved))
-        result = fit(problem, [s.block for s in stages], sweeps, correction=correction, progress=None if progress is None
-                     else lambda name, done, _, k=round_: progress(name, k * len(stages) + done, ROUNDS * len(stages)))  # fmt: skip
+        result = fit(problem, [s.block for s in stages], sweeps, correction=correction, progress=told(round_))
         correction, history = result.correction, [*history, *result.history]
         moved = result.motion[np.arange(small.frame_count)]
         used = allowed if not round_ else np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
@@ -195,7 +202,7 @@ def _final(controls: Sequence[Control], basis: Basis, correction: Correction) ->
 
 def _stages(
     character: Character, blocks: Sequence[str], pairs: tuple[Pair, ...], objective: str,
-    allowed: Float[np.ndarray, "frames pairs"],
+    allowed: Float[np.ndarray, "frames pairs"], quiet: Bool[np.ndarray, " pairs"],
 ) -> list[Stage]:  # fmt: skip
     """The blocks of each recipe, in order: left arm, right arm, legs."""
     made = []
@@ -209,7 +216,7 @@ def _stages(
             clearance = build_clearance(character, mine, objective)
             columns = [pairs.index(p) for p in clearance.pairs]
             block = Block(name, controls, (f"{name}_clearance", "effort", "smoothness"))
-            made.append(Stage(block, clearance, columns, allowed[:, columns]))
+            made.append(Stage(block, clearance, columns, allowed[:, columns], quiet[columns]))
     return made
 
 
@@ -222,7 +229,8 @@ def _problem(
     terms: dict[str, Term] = {}
     for stage in stages:
         # however much the skin shows: a part that is LEAST_GAP away from the other's field is pushed no further
-        limit = _smooth_floor(np.maximum(stage.allowed - beyond[:, stage.columns], -LEAST_GAP), float(seen.motion.dt))
+        limit = np.maximum(stage.allowed - beyond[:, stage.columns], -LEAST_GAP)
+        limit = np.where(stage.quiet, stage.allowed, _smooth_floor(limit, float(seen.motion.dt)))
         # the frames that only fill the bucket cost nothing
         limit = np.concatenate([limit, np.full((length - real, limit.shape[1]), 1e3)])
         name = f"{stage.block.name}_clearance"
