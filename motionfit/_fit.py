@@ -33,15 +33,17 @@ STATUS_ADVICE = {
 class Block(eqx.Module):
     """Which controls are free, which terms count, which optimistix solver, how many steps.
 
-    `solver` is any optimistix least-squares solver (default: Levenberg-Marquardt) or minimiser; `terms=None`
-    means all terms of the problem.
+    `solver` is any optimistix least-squares solver or minimiser. The default is Levenberg-Marquardt, banded in time
+    where the terms' reach is known, which stops at a `tolerance`, relative and absolute, in control points [rad] and
+    residuals. `terms=None` means all terms of the problem.
     """
 
     name: str = eqx.field(static=True)
     controls: tuple[str, ...] = eqx.field(static=True)
     terms: tuple[str, ...] | None = eqx.field(static=True, default=None)
-    max_steps: int = eqx.field(static=True, default=24)
+    max_steps: int = eqx.field(static=True, default=40)
     solver: optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser | None = None
+    tolerance: float = eqx.field(static=True, default=1e-5)
 
 
 class BlockReport(eqx.Module):
@@ -97,7 +99,7 @@ class Fit(eqx.Module):
 
 
 def levenberg_marquardt(
-    linear_solver: lx.AbstractLinearSolver | None = None, rtol: float = 1e-3, atol: float = 1e-3
+    linear_solver: lx.AbstractLinearSolver | None = None, rtol: float = 1e-5, atol: float = 1e-5
 ) -> optx.LevenbergMarquardt:
     """The default solver. Without a `Banded` solver its normal equations are dense and factorised by Cholesky: the
     damping keeps them definite, and a tall QR of the same system takes several times longer."""
@@ -213,8 +215,7 @@ def block_solver(problem: Problem, block: Block):
     """The solver of a block: its own, or Levenberg-Marquardt, banded in time where its terms' reach is known."""
     if block.solver is not None:
         return block.solver
-    banded = banded_solver(problem, block)
-    return levenberg_marquardt(banded)
+    return levenberg_marquardt(banded_solver(problem, block), block.tolerance, block.tolerance)
 
 
 def banded_solver(problem: Problem, block: Block) -> Banded | None:

@@ -102,7 +102,7 @@ def test_frame_local_rule_gives_the_same_jacobian(still):
     controls = tuple(_control(character, motion, r) for r in ("left_upper_arm", "left_forearm"))
     hand = (character.skeleton.joint("left_hand"),)
     problem = mf.Problem(character, motion, {"t": mf.terms.JointTracking(hand, np.zeros((20, 1, 3)))}, controls)
-    rows = _Rows(problem, jnp.zeros((20, 2)), (0, 1), ("t",))
+    rows = _Rows(problem.objective(), jnp.zeros((20, 2)), jnp.array([0, 1]), (0,))
     signals = jnp.asarray(np.random.default_rng(1).normal(size=(20, 2)))
     fast = jax.jacfwd(lambda s: _frame_local_rows(s, rows))(signals)
     np.testing.assert_allclose(fast, jax.jacfwd(rows)(signals), atol=1e-9)

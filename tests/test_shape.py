@@ -133,7 +133,8 @@ def test_probes_are_skinned_vertices(heavy):
     kin = mf.forward_kinematics(heavy.skeleton, walk)
     exact = mf.skin(heavy.skin, kin)[0][:, mine]
     told = jnp.moveaxis(make_probes(heavy, "left_upper_arm", mine).positions_world(kin), 0, -1)
-    assert np.linalg.norm(told - exact, axis=-1).max() < 2e-3  # weights of joints far away are left out
+    error = np.linalg.norm(told - exact, axis=-1)
+    assert np.median(error) < 1e-4 and error.max() < 0.025  # weights of joints further away are left out
 
 
 def test_girth_of_one_changes_no_bit(average):

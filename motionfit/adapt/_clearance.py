@@ -139,20 +139,19 @@ def _joint(character: Character, pairs: tuple[Pair, ...]) -> Clearance:
     trunk = skeleton.joint("chest") if len(spine) < 2 else spine[len(spine) // 2]
     radius = {role: float(np.mean(volumes.radii[k])) for k, role in enumerate(volumes.roles)}
     trunk_radius = max(radius[r] for r in _roles_of(character, "torso", volumes.roles))
-    legs = all(p.block == "legs" for p in pairs)
     rows = []
     for k, pair in enumerate(pairs):
         side, _, kind = pair.first.partition("_")
         if pair.second == "torso" and kind == "upper_arm":
-            rows.append((k, skeleton.joint(f"{side}_forearm"), trunk, trunk_radius + radius[f"{side}_forearm"]))
-        elif kind in ("thigh", "calf") and legs:
+            rows.append((k, skeleton.joint(f"{side}_forearm"), trunk, trunk_radius + radius[f"{side}_forearm"], False))
+        elif pair.block == "legs":
             joint = {"thigh": "calf", "calf": "foot"}[kind]
             rows.append((k, skeleton.joint(f"left_{joint}"), skeleton.joint(f"right_{joint}"),
-                         radius[pair.first] + radius[pair.second]))  # fmt: skip
+                         radius[pair.first] + radius[pair.second], True))  # fmt: skip
     kept = sorted({k for k, *_ in rows})
-    owner, first, second, limit = (tuple(column) for column in zip(*rows, strict=True))
-    frontal = (skeleton.joint("left_thigh"), skeleton.joint("right_thigh")) if legs else None
-    term = JointClearance(first, second, np.array([limit]), frontal=frontal)
+    owner, first, second, limit, frontal = (tuple(column) for column in zip(*rows, strict=True))
+    thighs = (skeleton.joint("left_thigh"), skeleton.joint("right_thigh")) if any(frontal) else None
+    term = JointClearance(first, second, np.array([limit]), frontal=frontal, thighs=thighs)
     return Clearance(term, tuple(pairs[k] for k in kept), tuple(kept.index(k) for k in owner))
 
 

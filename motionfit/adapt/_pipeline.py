@@ -39,7 +39,7 @@ SIGMA_EFFORT = {
     "hip_turn": 0.1,
     "thighs_apart": 1.0,
 }  # [rad]
-JERK_SHARE = 1.0  # of the hands' own jerk, what the correction may add at the cost of 1 per frame
+JERK_SHARE = 4.0  # of the hands' own jerk, what the correction may add at the cost of 1 per frame
 LEVER = 0.5  # [m] shoulder to hand
 LEAST_JERK = 30.0  # [m/s^3] for clips that stand still
 MOST_JERK = 1.04  # ratio to the source's
@@ -215,7 +215,8 @@ def _stages(
         for name, controls, mine in wanted:
             clearance = build_clearance(character, mine, objective)
             columns = [pairs.index(p) for p in clearance.pairs]
-            block = Block(name, controls, (f"{name}_clearance", "effort", "smoothness"))
+            terms = (f"{name}_clearance", "effort", "smoothness")
+            block = Block(name, controls, terms, max_steps=24, tolerance=1e-3)
             made.append(Stage(block, clearance, columns, allowed[:, columns], quiet[columns]))
     return made
 

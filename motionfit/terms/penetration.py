@@ -34,8 +34,8 @@ def hinge(depth: Float[AnyArray, "..."], width: float | Float[AnyArray, ""]) -> 
 class JointClearance(Term):
     """Joints at a threshold distance: the d_i of thesis (4.6), (4.10) and (4.11).
 
-    `first`, `second` are joint indices per pair, `min_distance` [m] per pair, or per frame and pair. With
-    `frontal` the distance is measured on the plane of the vertical and the line between the thighs, which is the
+    `first`, `second` are joint indices per pair, `min_distance` [m] per pair, or per frame and pair. Where `frontal`
+    says so the distance is measured on the plane of the vertical and the line between the `thighs`, which is the
     matrix M of (4.11): the actual separation of the legs. `sigma` [m].
     """
 
@@ -44,16 +44,19 @@ class JointClearance(Term):
     min_distance: Float[AnyArray, "*frames pairs"]
     sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.01)
     width: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.002)
-    frontal: tuple[int, int] | None = eqx.field(static=True, default=None)
+    frontal: tuple[bool, ...] = eqx.field(static=True, default=())
+    thighs: tuple[int, int] | None = eqx.field(static=True, default=None)
 
     def distance(self, kin: Kinematics) -> Float[Array, "frames pairs"]:
         gap = kin.positions_world[:, np.array(self.first)] - kin.positions_world[:, np.array(self.second)]
-        if self.frontal is not None:
-            left, right = (kin.positions_world[:, j] for j in self.frontal)
-            across = rotation.normalize((left - right) * jnp.array([1.0, 0.0, 1.0], gap.dtype))[:, None]
-            lateral = jnp.sum(gap * across, axis=-1)
-            gap = jnp.stack([lateral, gap[..., 1]], axis=-1)
-        return rotation.safe_norm(gap)
+        distance = rotation.safe_norm(gap)
+        if self.thighs is None:
+            return distance
+        left, right = (kin.positions_world[:, j] for j in self.thighs)
+        across = rotation.normalize((left - right) * jnp.array([1.0, 0.0, 1.0], gap.dtype))[:, None]
+        lateral = jnp.sum(gap * across, axis=-1)
+        separation = rotation.safe_norm(jnp.stack([lateral, gap[..., 1]], axis=-1))
+        return jnp.where(np.array(self.frontal), separation, distance)
 
     def residual(self, kin: Kinematics) -> Float[Array, "frames pairs"]:
         short = jnp.asarray(self.min_distance).reshape(-1, len(self.first)) - self.distance(kin)
