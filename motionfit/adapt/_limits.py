@@ -14,12 +14,12 @@ from motionfit.shape.pairs import Pair
 LEAST_LOOKS, LOOK_SHARE = 16, 1 / 30  # looks at the skin: at least, and per frame that the solver sees
 LOOK_STEP = 0.007  # [m]
 ENOUGH = 0.75  # of TOLERANCE: what a look may still show
-SHOULDER_SLACK = 1.2  # of the tolerance at the armpit, whose overlap at ease varies with the pose
+SHOULDER_SLACK = 1.25  # of the tolerance at the armpit, whose overlap at ease varies with the pose
 
 
 def at_ease(body: Character) -> Motion:
-    """Standing with the arms hanging, and swung as in a walk or a run."""
-    poses = [standing(body.skeleton, swing) for swing in (-0.7, -0.35, 0.0, 0.35)]
+    """Standing with the arms hanging, and swung as in a walk."""
+    poses = [standing(body.skeleton, swing) for swing in (-0.35, 0.0, 0.35)]
     return Motion(body.skeleton, np.concatenate([p.root for p in poses]),
                   np.concatenate([p.rotations for p in poses]), poses[0].dt)  # fmt: skip
 
@@ -30,7 +30,7 @@ def reference_depths(
     """Depth [m] on the volumes that does not count, per frame and pair, and that of the joint itself, per pair.
 
     The first is what the clip shows on the reference body, without one what the character shows in its rest pose. The
-    second is what the reference shows standing at ease, for parts that meet at a joint: measured against the
+    second is the least that the reference shows standing at ease, for parts that meet at a joint: measured against the
     reference frame by frame, that overlap would count as excess wherever a clip holds the arms out, as every adapted
     clip does, and each further adaptation would push them further out.
     """
@@ -43,7 +43,7 @@ def reference_depths(
     both = Motion(body.skeleton, np.concatenate([moving.root, easy.root]),
                   np.concatenate([moving.rotations, easy.rotations]), moving.dt)  # fmt: skip
     depths = volume_depths(clearance, both)
-    return depths[: clip.frame_count], depths[clip.frame_count :].max(axis=0) * _adjacent(pairs)
+    return depths[: clip.frame_count], depths[clip.frame_count :].min(axis=0) * _adjacent(pairs)
 
 
 def _adjacent(pairs: tuple[Pair, ...]) -> Bool[np.ndarray, " pairs"]:
@@ -65,7 +65,7 @@ class SkinLooks:
         self.own = skin_depths(reference, onto(clip[self.at], reference.skeleton), pairs).depth
         key = ("skin at ease", pairs)
         if key not in reference.memo:
-            reference.memo[key] = skin_depths(reference, at_ease(reference), pairs).depth.max(axis=0)
+            reference.memo[key] = skin_depths(reference, at_ease(reference), pairs).depth.min(axis=0)
         self.at_ease = reference.memo[key] * _adjacent(pairs)
 
     def depths(self, motion: Motion) -> Float[np.ndarray, "looks pairs"]:
