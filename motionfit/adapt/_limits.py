@@ -13,7 +13,7 @@ from motionfit.shape.pairs import Pair
 
 LEAST_LOOKS, LOOK_SHARE = 16, 1 / 30  # looks at the skin: at least, and per frame that the solver sees
 LOOK_STEP = 0.007  # [m]
-ENOUGH = 0.75  # of TOLERANCE: what a look may still show
+ENOUGH = 0.7  # of TOLERANCE: what a look may still show
 SHOULDER_SLACK = 1.25  # of the tolerance at the armpit, whose overlap at ease varies with the pose
 
 

@@ -30,7 +30,7 @@ BLOCKS = ("arms", "legs")
 SOLVE_RATE = 60.0  # [1/s] of the frames that the solver sees: between two of them a limb's depth changes by millimetres
 KNOT_SPACING = 0.1  # [s]
 SOLVE_PROBES = {"upper_arm": 20, "forearm": 16, "hand": 12, "thigh": 20, "calf": 20}  # per pair, of those looked at
-ALLOWED_EXCESS = 0.005  # [m] that may stay where more was; well under TOLERANCE, which the skin is judged by
+ALLOWED_EXCESS = 0.004  # [m] that may stay where more was; well under TOLERANCE, which the skin is judged by
 MARGIN = 0.001  # [m]
 LEAST_GAP = 0.005  # [m]
 # Across and twist are there for what r alone cannot do, and the skin around a shoulder is known least where it twists
