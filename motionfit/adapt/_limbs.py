@@ -1,7 +1,7 @@
-"""`adapt`: a clip and a character in, an adapted clip out. Thesis 4.4 and 4.5, block after block."""
+"""The blocks that take arms and legs out of what they sink into: thesis 4.4 and 4.5."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,17 +15,15 @@ from motionfit._motion import Motion, bucket, host_kinematics
 from motionfit._onto import onto
 from motionfit._problem import During, Problem, Term
 from motionfit._skeleton import SIDES
-from motionfit._types import InputError
 from motionfit.adapt._clearance import Clearance, allowance, build_clearance, reduced, support, volume_depths
 from motionfit.adapt._controls import arm_controls, leg_controls
 from motionfit.adapt._limits import ENOUGH, SkinLooks, reference_depths
 from motionfit.metrics import TOLERANCE, derivative_ratio
-from motionfit.shape.growth import grow
 from motionfit.shape.pairs import Pair, pairs_of
 from motionfit.splines import Basis, bspline_basis
 from motionfit.terms.pose import Effort, Smoothness
 
-BLOCKS = ("arms", "legs")
+LIMBS = ("arms", "legs")
 
 SOLVE_RATE = 60.0  # [1/s] of the frames that the solver sees: between two of them a limb's depth changes by millimetres
 KNOT_SPACING = 0.1  # [s]
@@ -67,38 +65,26 @@ class Seen(NamedTuple):
     controls: tuple[Control, ...]
 
 
-def adapt(
+def limbs(
     clip: Motion,
     character: Character,
     *,
     reference: Character | None = None,
-    girth: Mapping[str, float] | None = None,
-    blocks: Sequence[str] = BLOCKS,
+    blocks: Sequence[str] = LIMBS,
     objective: str = "vertex",
     sweeps: int = 1,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Fit:
-    """Adapt a clip to the shape of a character.
-
-    The clip is put on the character (`motionfit.onto`), then the blocks run in turn, `sweeps` times: `arms` keeps
-    upper arms, forearms and hands out of the trunk and the thighs, the left arm first, `legs` the thighs and calves
-    apart. Penetration counts as far as it exceeds what the same clip shows on `reference`, the body that it was made
-    for; without one, on the character before `girth`, else in its rest pose.
+    """Take the arms out of the trunk and the thighs, and the legs out of each other.
 
     The solver sees 60 frames per second, and the skin's probes that matter. Afterwards all probes are looked at, with
     a reference also the skinned mesh itself at some frames, and the jerk; where more than the tolerance is left the
     volumes get less room, where the jerk grew the correction gets smoother, and the blocks run again from where they
     were.
 
-    The `Fit` holds the adapted motion, the correction, what each block did, and per pair and seen frame
-    (`fit.details["frames"]`) the excess depth [m] on the volumes before and after
-    (`fit.details["excess_before_m"]`, `["excess_after_m"]`).
+    `fit.details` holds per pair and seen frame (`["frames"]`) the excess depth [m] on the volumes before and after
+    (`["excess_before_m"]`, `["excess_after_m"]`). `blocks` are run in the order given, `sweeps` times.
     """
-    unknown = [b for b in blocks if b not in BLOCKS]
-    if unknown or not blocks:
-        raise InputError(f"unknown block {', '.join(map(repr, unknown)) or 'list'}; blocks: {', '.join(BLOCKS)}")
-    if girth:
-        reference, character = reference or character, grow(character, girth)
     base = onto(clip, character.skeleton)
     controls, whole, seen = _controls(character, base, blocks)
     everything = build_clearance(character, pairs_of(*blocks), objective)
@@ -271,13 +257,3 @@ def _tighten(stage: Stage, left: Float[np.ndarray, "frames pairs"], dt: float) -
     width = max(1, round(0.1 / dt))
     more = gaussian_filter1d(maximum_filter1d(more, 2 * width + 1, axis=0), width / 2, axis=0, mode="nearest")
     return stage._replace(allowed=stage.allowed - np.minimum(1.3 * more, 0.02))
-
-
-def arms(clip: Motion, character: Character, **options) -> Fit:
-    """The arm block alone: thesis 4.4.1. Options as in `adapt`."""
-    return adapt(clip, character, blocks=("arms",), **options)
-
-
-def legs(clip: Motion, character: Character, **options) -> Fit:
-    """The leg block alone: thesis 4.5. Options as in `adapt`."""
-    return adapt(clip, character, blocks=("legs",), **options)

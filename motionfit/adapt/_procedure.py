@@ -1,0 +1,63 @@
+"""`adapt`: a clip and a character in, an adapted clip out. The whole procedure of thesis 5.2, block after block."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+from motionfit._character import Character
+from motionfit._control import Correction
+from motionfit._fit import Fit
+from motionfit._motion import Motion
+from motionfit._onto import onto
+from motionfit._problem import Problem
+from motionfit._types import InputError
+from motionfit.adapt._limbs import LIMBS, limbs
+from motionfit.shape.growth import grow
+
+Progress = Callable[[str, int, int], None]
+
+BLOCKS = (*LIMBS,)
+
+
+def adapt(
+    clip: Motion,
+    character: Character,
+    *,
+    reference: Character | None = None,
+    girth: Mapping[str, float] | None = None,
+    blocks: Sequence[str] = BLOCKS,
+    objective: str = "vertex",
+    sweeps: int = 1,
+    progress: Progress | None = None,
+) -> Fit:
+    """Adapt a clip to the shape of a character.
+
+    The clip is put on the character (`motionfit.onto`), then the blocks run in the order of thesis 5.2: `arms` keeps
+    upper arms, forearms and hands out of the trunk and the thighs, the left arm first, `legs` the thighs and calves
+    apart. Penetration counts as far as it exceeds what the same clip shows on `reference`, the body that it was made
+    for; without one, on the character before `girth`, else in its rest pose.
+
+    The `Fit` holds the adapted motion, the correction, what each block did, and in `details` what the blocks
+    measured: see `motionfit.adapt.limbs`.
+    """
+    unknown = [b for b in blocks if b not in BLOCKS]
+    if unknown or not blocks:
+        raise InputError(f"unknown block {', '.join(map(repr, unknown)) or 'list'}; blocks: {', '.join(BLOCKS)}")
+    if girth:
+        reference, character = reference or character, grow(character, girth)
+    base = onto(clip, character.skeleton)
+    first = tuple(b for b in LIMBS if b in blocks)
+    if first:
+        fit = limbs(clip, character, reference=reference, blocks=first, objective=objective, sweeps=sweeps,
+                    progress=progress)  # fmt: skip
+    else:
+        fit = Fit(Correction((), ()), base, base, "converged", (), Problem(character, base, {}, ()))
+    return fit
+
+
+def arms(clip: Motion, character: Character, **options) -> Fit:
+    """The arm block alone: thesis 4.4.1. Options as in `adapt`."""
+    return adapt(clip, character, blocks=("arms",), **options)
+
+
+def legs(clip: Motion, character: Character, **options) -> Fit:
+    """The leg block alone: thesis 4.5. Options as in `adapt`."""
+    return adapt(clip, character, blocks=("legs",), **options)
