@@ -34,6 +34,7 @@ from motionfit._skeleton import Skeleton as Skeleton
 from motionfit._skinning import Skin as Skin
 from motionfit._skinning import skin as skin
 from motionfit._types import InputError as InputError
+from motionfit.adapt._many import adapt_many as adapt_many
 from motionfit.feet._remove import detect_footplants as detect_footplants
 from motionfit.feet._remove import remove_footskate as remove_footskate
 from motionfit.io import load_character as load_character
@@ -43,7 +44,7 @@ from motionfit.metrics import measure as measure
 
 __all__ = [
     "Block", "Character", "Control", "Correction", "Custom", "Drive", "During", "Energy", "Fit", "InputError",
-    "Kinematics", "Motion", "Problem", "Robust", "Skeleton", "Skin", "Term", "adapt", "balance", "detect_footplants",
+    "Kinematics", "Motion", "Problem", "Robust", "Skeleton", "Skin", "Term", "adapt", "adapt_many", "balance", "detect_footplants",
     "dynamics", "feet", "fit", "forward_kinematics", "ik", "load_character", "load_correction", "load_motion", "measure",
     "metrics", "onto", "remove_footskate", "resample", "rotation", "save", "shape", "skin", "splines", "terms",
 ]  # fmt: skip

@@ -227,7 +227,7 @@ def banded_solver(problem: Problem, block: Block) -> Banded | None:
     reaches = [problem.terms[k].reach for k in terms if isinstance(problem.terms[k], Term)]  # type: ignore
     if not same or any(r is None for r in reaches):
         return None
-    return Banded.of(bases[0], max(reaches, default=0))
+    return Banded.of(bases[0], max(reaches, default=0), local=1)  # `solve_block` gives the frame-local rows first
 
 
 # optimistix's default adjoint calls a system singular where a control cannot be observed (no frame in contact)

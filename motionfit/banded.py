@@ -31,14 +31,19 @@ class Banded(lx.AbstractLinearSolver):
     arrays with the frames first. Two more kinds of operators are understood: the damped ones of optimistix, whose
     output is (rows, sqrt(lambda) x), and square symmetric ones from x to x, such as the Hessian of an implicit
     derivative. Made by `Banded.of`. A rank deficient matrix is kept factorisable by a small ridge.
+
+    Of the first `local` arrays of rows it is known that frame t sees the *signals* of frame t only. A control's
+    columns are then multiples of one column per frame, and products of n rows are needed per control, not per pair of
+    control points.
     """
 
     first: Int[AnyArray, " frames"]
     frames_of: Int[AnyArray, "points rows"]
     width: int = eqx.field(static=True)
+    local: int = eqx.field(static=True, default=0)
 
     @classmethod
-    def of(cls, basis: Basis, reach: int = 0) -> "Banded":
+    def of(cls, basis: Basis, reach: int = 0, local: int = 0) -> "Banded":
         """The solver for rows of frame t that see the signals of frames t - reach .. t + reach."""
         last = np.asarray(basis.first)
         frames = len(last)
@@ -52,7 +57,7 @@ class Banded(lx.AbstractLinearSolver):
         frames_of = np.full((basis.count, max(int(counts.max()), 1)), frames, np.int32)
         starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
         frames_of[first[order], np.arange(frames) - starts[first[order]]] = order
-        return cls(first, frames_of, width)
+        return cls(first, frames_of, width, local)
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]):
         del options
@@ -117,9 +122,16 @@ class Banded(lx.AbstractLinearSolver):
         damped = damped and _shapes(operator.out_structure()[1]) == _shapes(operator.in_structure())
         damping = leaves[-controls:] if damped else []
         rows = leaves[: len(leaves) - len(damping)]
-        windows = self.windows(jnp.concatenate([_flat(r) for r in rows], axis=2), controls)
-        squares = jnp.einsum("kin,kjn->kij", windows, windows)
-        squares = squares.reshape(-1, width, controls, width, controls)
+        gram = 0.0
+        for k, leaf in enumerate(rows):
+            columns = leaf.reshape(controls, width, leaf.shape[1], -1)
+            gram = gram + (_gram_of_multiples(columns) if k < self.local else _gram(columns))
+        # from the order of colours to that of a frame's own control points, then all frames of one window together
+        place = (jnp.asarray(self.first)[:, None] + np.arange(width, dtype=np.int32)) % width
+        gram = jnp.take_along_axis(gram, place[:, :, None, None, None], axis=1)
+        gram = jnp.take_along_axis(gram, place[:, None, None, :, None], axis=3)
+        gram = jnp.pad(gram, ((0, 1), *((0, 0),) * 4))
+        squares = jnp.sum(gram[jnp.asarray(self.frames_of)], axis=1)
         band = []
         for i in range(width):  # the blocks that couple a control point with the i-th after it
             shifted = [jnp.pad(squares[:, p, :, p + i, :], ((p, 0), (0, 0), (0, 0)))[:points] for p in range(width - i)]
@@ -146,8 +158,22 @@ class Banded(lx.AbstractLinearSolver):
         return jnp.stack(band, axis=1)
 
 
-def _flat(rows: Float[Array, "colours frames ..."]) -> Float[Array, "colours frames n"]:
-    return rows.reshape(rows.shape[0], rows.shape[1], -1)
+def _gram(columns: Float[Array, "controls width frames n"]) -> Float[Array, "frames width controls width controls"]:
+    """Products of all columns within each frame."""
+    controls, width, frames, _ = columns.shape
+    rows = jnp.transpose(columns, (2, 1, 0, 3)).reshape(frames, width * controls, -1)
+    return jnp.einsum("tin,tjn->tij", rows, rows).reshape(frames, width, controls, width, controls)
+
+
+def _gram_of_multiples(
+    columns: Float[Array, "controls width frames n"],
+) -> Float[Array, "frames width controls width controls"]:
+    """The same where a control's columns of one frame are multiples of their sum."""
+    total = jnp.sum(columns, axis=1)
+    size = jnp.sum(jnp.square(total), axis=-1)
+    share = jnp.sum(columns * total[:, None], axis=-1) / jnp.where(size > 0.0, size, 1.0)[:, None]
+    products = jnp.einsum("ctn,dtn->tcd", total, total)
+    return jnp.einsum("cpt,dqt,tcd->tpcqd", share, share, products)
 
 
 def _size(unknowns) -> tuple[int, int]:

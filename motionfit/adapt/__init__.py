@@ -6,9 +6,21 @@ import types
 from motionfit.adapt._clearance import OBJECTIVES, build_clearance, volume_depths
 from motionfit.adapt._limbs import limbs
 from motionfit.adapt._limits import reference_depths
+from motionfit.adapt._many import adapt_many
 from motionfit.adapt._procedure import BLOCKS, adapt, arms, legs
 
-__all__ = ["BLOCKS", "OBJECTIVES", "adapt", "arms", "build_clearance", "legs", "limbs", "reference_depths", "volume_depths"]
+__all__ = [
+    "BLOCKS",
+    "OBJECTIVES",
+    "adapt",
+    "adapt_many",
+    "arms",
+    "build_clearance",
+    "legs",
+    "limbs",
+    "reference_depths",
+    "volume_depths",
+]
 
 
 class _CallableModule(types.ModuleType):

@@ -15,6 +15,7 @@ from motionfit._motion import Motion, bucket, host_kinematics
 from motionfit._onto import onto
 from motionfit._problem import During, Problem, Term
 from motionfit._skeleton import SIDES
+from motionfit._types import InputError
 from motionfit.adapt._clearance import Clearance, allowance, build_clearance, reduced, support, volume_depths
 from motionfit.adapt._controls import arm_controls, leg_controls
 from motionfit.adapt._limits import ENOUGH, SkinLooks, reference_depths
@@ -41,7 +42,8 @@ JERK_SHARE = 4.0  # of the hands' own jerk, what the correction may add at the c
 LEVER = 0.5  # [m] shoulder to hand
 LEAST_JERK = 30.0  # [m/s^3] for clips that stand still
 MOST_JERK = 1.04  # ratio to the source's
-ROUNDS = 6
+ROUNDS, PATIENCE = 9, 2  # rounds at most, and rounds without a better result
+CLOSER = (0, 1)  # rounds after which more frames are looked at
 
 
 class Stage(NamedTuple):
@@ -53,6 +55,17 @@ class Stage(NamedTuple):
     columns: list[int]
     allowed: Float[np.ndarray, "frames pairs"]
     quiet: Bool[np.ndarray, " pairs"]
+
+
+class Iterate(NamedTuple):
+    """A round's result; `faults` (jerk over the limit, violations left, violations foreseen) say how good it is."""
+
+    faults: tuple[float, ...]
+    correction: Correction
+    problem: Problem | None
+    depths: Float[np.ndarray, "frames pairs"]
+    held_back: Float[np.ndarray, "frames pairs"]
+    left: float  # [m]
 
 
 class Seen(NamedTuple):
@@ -73,6 +86,7 @@ def limbs(
     blocks: Sequence[str] = LIMBS,
     objective: str = "vertex",
     sweeps: int = 1,
+    start: Fit | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Fit:
     """Take the arms out of the trunk and the thighs, and the legs out of each other.
@@ -83,7 +97,9 @@ def limbs(
     were.
 
     `fit.details` holds per pair and seen frame (`["frames"]`) the excess depth [m] on the volumes before and after
-    (`["excess_before_m"]`, `["excess_after_m"]`). `blocks` are run in the order given, `sweeps` times.
+    (`["excess_before_m"]`, `["excess_after_m"]`), and how much less than the tolerance the fields were allowed in
+    the end (`["held_back_m"]`). `blocks` are run in the order given, `sweeps` times, starting from zero or from the
+    result of an earlier `start` for the same clip.
     """
     base = onto(clip, character.skeleton)
     controls, whole, seen = _controls(character, base, blocks)
@@ -102,16 +118,23 @@ def limbs(
         looks = SkinLooks(clip[seen.frames], character, reference, pairs)
         on_skin = looks.depths(small)
         quiet = (before - np.maximum(own, joint_own)).max(axis=0) <= slack * TOLERANCE
-        quiet &= looks.quiet(on_skin)
+        quiet &= looks.quiet(on_skin, small)
         beyond = np.where(quiet, 0.0, looks.beyond(on_skin, excess, ALLOWED_EXCESS))
     kept = own + allowance(excess + beyond, ALLOWED_EXCESS, MARGIN)
     # parts that do not meet at a joint touch less on the reference once the clip is adapted: what is kept must pass
     # for no violation then either, and is still a touch
     kept = np.where([p.adjacent for p in pairs], kept, np.minimum(kept, ENOUGH * TOLERANCE))
+    if start is not None:
+        _check_start(start, seen, pairs)
+        beyond = np.where(quiet, 0.0, np.maximum(beyond, start.details["held_back_m"]))
     allowed = np.where(quiet, np.maximum(before, own), kept)
 
     stages = _stages(character, blocks, pairs, objective, allowed, quiet)
-    smooth, history, correction, moved = _jerk_scale(base), [], Correction.zero(seen.controls), small
+    smooth, history, moved = _jerk_scale(base), [], small
+    points = Correction.zero(seen.controls).points if start is None else start.correction.points
+    # a whole clip has no more control points than the bucket that the solver sees
+    correction = Correction(seen.controls, tuple(_filled(p, seen.basis.count) for p in points))
+    best, since = Iterate((np.inf,), correction, None, before, beyond, np.inf), 0
     steps = sweeps * len(stages)
 
     def told(round_: int):
@@ -127,26 +150,57 @@ def limbs(
         used = allowed if not round_ else np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
         used = used - beyond
         after = volume_depths(everything, moved)
-        over = np.where(quiet, 0.0, after - own)
-        if looks is not None:
+        if looks is None:
+            over = left = np.where(quiet, 0.0, after - own)
+        else:
+            if round_ in CLOSER:
+                looks.look_closer((after - own).max(axis=1))
             on_skin = looks.depths(moved)
+            # what the first looks missed
+            woken = quiet & ~looks.quiet(on_skin, moved, 1.0)
+            quiet = quiet & ~woken
+            stages = [_wake(s, woken[s.columns], kept[:, s.columns]) for s in stages]
+            left = looks.joined(after - own, on_skin - looks.own, quiet)
+            if left.max() <= ENOUGH * TOLERANCE:
+                looks.foresee(moved)
+            over = looks.joined(after - own, on_skin - looks.basis, quiet)
             beyond = np.where(quiet, 0.0, looks.beyond(on_skin, after - own, ALLOWED_EXCESS, beyond))
-            over[looks.at] = np.where(quiet, 0.0, np.maximum(over[looks.at], on_skin - looks.own))
-        clean = over.max(initial=0.0) <= ENOUGH * TOLERANCE
         jerk = derivative_ratio(_final(controls, whole, correction).apply(base), base, 3) or 1.0
-        if (clean and jerk <= MOST_JERK) or round_ == ROUNDS - 1:
+        faults = (max(jerk - MOST_JERK, 0.0), *(_amount(x) for x in (left, over)))
+        # one that was looked at in fewer frames cannot be compared
+        if faults < best.faults or round_ in CLOSER:
+            best, since = Iterate(faults, correction, result.problem, after, allowed - used, left.max(initial=0.0)), 0
+        since += 1
+        if not any(faults) or since > PATIENCE:
             break
         if jerk > MOST_JERK:
             smooth *= 0.5
-        if not clean:
+        if over.max() > ENOUGH * TOLERANCE:
             # the solver sees some probes only, and its corrections are smooth: what they left is taken off
-            left = np.where(over > 0.7 * TOLERANCE, after - used, 0.0)
-            stages = [_tighten(s, left[:, s.columns], float(small.dt)) for s in stages]
-    final = _final(controls, whole, correction)
-    status = "violations_left" if over.max(initial=0.0) > TOLERANCE else "converged"
+            more = np.where(over > ENOUGH * TOLERANCE, after - used, 0.0)
+            stages = [_tighten(s, more[:, s.columns], float(small.dt)) for s in stages]
+    final = _final(controls, whole, best.correction)
+    status = "violations_left" if best.left > TOLERANCE else "converged"
     details = {"pairs": [p.name for p in pairs], "frames": seen.frames, "excess_before_m": excess,
-               "excess_after_m": after - own}  # fmt: skip
-    return Fit(final, final.apply(base), base, status, tuple(history), result.problem, details)
+               "excess_after_m": best.depths - own, "held_back_m": best.held_back}  # fmt: skip
+    return Fit(final, final.apply(base), base, status, tuple(history), best.problem, details)
+
+
+def _check_start(start: Fit, seen: Seen, pairs: tuple[Pair, ...]) -> None:
+    had = start.details.get("pairs"), [c.name for c in start.correction.controls]
+    wanted = [p.name for p in pairs], [c.name for c in seen.controls]
+    if had != wanted or len(start.details["frames"]) != len(seen.frames):
+        raise InputError("start= is a fit of another clip, other blocks or another objective; give one of the same clip "
+                         "and blocks, or leave it out")  # fmt: skip
+
+
+def _filled(points, count: int) -> Float[np.ndarray, " count"]:
+    return np.concatenate([np.asarray(points, float), np.zeros(count - len(points))])
+
+
+def _amount(over: Float[np.ndarray, "frames pairs"]) -> float:
+    """Mean over frames of what goes beyond what a look may show [m]."""
+    return float(np.maximum(over - ENOUGH * TOLERANCE, 0.0).max(axis=1).mean())
 
 
 def _order(stages: list[Stage]) -> Int[np.ndarray, " pairs"]:
@@ -242,6 +296,11 @@ def _jerk_scale(base: Motion) -> float:
     positions = gaussian_filter1d(host_kinematics(base)[0][:, hands], 1 / (SOLVE_RATE * dt), axis=0, mode="nearest")
     jerk = float(np.linalg.norm(np.diff(positions, 3, axis=0), axis=-1).mean()) / dt**3
     return JERK_SHARE * max(jerk, LEAST_JERK) / LEVER
+
+
+def _wake(stage: Stage, woken: Bool[np.ndarray, " pairs"], kept: Float[np.ndarray, "frames pairs"]) -> Stage:
+    """The stage with some pairs no longer left alone."""
+    return stage._replace(quiet=stage.quiet & ~woken, allowed=np.where(woken, kept, stage.allowed))
 
 
 def _smooth_floor(limit: Float[np.ndarray, "frames pairs"], dt: float) -> Float[np.ndarray, "frames pairs"]:

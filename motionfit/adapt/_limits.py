@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from motionfit._character import Character
-from motionfit._motion import Motion, rest_motion
+from motionfit._motion import Motion, host_kinematics, rest_motion
 from motionfit._onto import onto
 from motionfit.adapt._clearance import build_clearance, volume_depths
 from motionfit.metrics import TOLERANCE, skin_depths
@@ -12,9 +12,12 @@ from motionfit.shape.field import standing
 from motionfit.shape.pairs import Pair
 
 LEAST_LOOKS, LOOK_SHARE = 16, 1 / 30  # looks at the skin: at least, and per frame that the solver sees
+NEARLY = 0.9  # of TOLERANCE: what passes for no violation, since between two looks there may be a little more
+LOOKS_APART = 4  # [frames] that two looks are at least apart
 LOOK_STEP = 0.007  # [m]
 ENOUGH = 0.7  # of TOLERANCE: what a look may still show
 SHOULDER_SLACK = 1.25  # of the tolerance at the armpit, whose overlap at ease varies with the pose
+HALF_RAISED = tuple(np.deg2rad((18.0, 25.0, 55.0, 75.0)))  # [rad] from the trunk's axis down
 
 
 def at_ease(body: Character) -> Motion:
@@ -59,23 +62,64 @@ class SkinLooks:
 
     def __init__(self, clip: Motion, character: Character, reference: Character, pairs: tuple[Pair, ...]):
         """`clip` holds the frames that the solver sees."""
+        self.clip, self.character, self.reference, self.pairs = clip, character, reference, pairs
+        self.frames = np.arange(clip.frame_count)
         count = min(clip.frame_count, max(LEAST_LOOKS, round(clip.frame_count * LOOK_SHARE)))
         self.at: Int[np.ndarray, " looks"] = np.unique(np.linspace(0, clip.frame_count - 1, count).round().astype(int))
-        self.frames, self.character, self.pairs = np.arange(clip.frame_count), character, pairs
-        self.own = skin_depths(reference, onto(clip[self.at], reference.skeleton), pairs).depth
+        self.own = self._own(clip, self.at)
+        self.basis = self.own.copy()
         key = ("skin at ease", pairs)
         if key not in reference.memo:
             reference.memo[key] = skin_depths(reference, at_ease(reference), pairs).depth.min(axis=0)
         self.at_ease = reference.memo[key] * _adjacent(pairs)
 
+    def _own(self, motion: Motion, at: Int[np.ndarray, " some"]) -> Float[np.ndarray, "some pairs"]:
+        """What the reference shows playing a motion."""
+        return skin_depths(self.reference, onto(motion[at], self.reference.skeleton), self.pairs).depth
+
     def depths(self, motion: Motion) -> Float[np.ndarray, "looks pairs"]:
         """Depth [m] per look and pair of a motion of the solver's frames."""
         return skin_depths(self.character, motion[self.at], self.pairs).depth
 
-    def quiet(self, seen: Float[np.ndarray, "looks pairs"]) -> Bool[np.ndarray, " pairs"]:
-        """The pairs that show no violation in any look."""
-        slack = np.where([p.first.endswith("upper_arm") for p in self.pairs], SHOULDER_SLACK, 1.0)
-        return (seen - np.maximum(self.own, self.at_ease)).max(axis=0) <= slack * TOLERANCE
+    def look_closer(self, risk: Float[np.ndarray, " frames"]) -> None:
+        """Look at more frames from now on: those of greatest `risk`, apart from each other and from former looks."""
+        risk, taken = risk.copy(), []
+        for frame in self.at:
+            risk[max(frame - LOOKS_APART, 0) : frame + LOOKS_APART + 1] = -np.inf
+        while len(taken) < len(self.at) // 2 and risk.max() > -np.inf:
+            taken.append(int(risk.argmax()))
+            risk[max(taken[-1] - LOOKS_APART, 0) : taken[-1] + LOOKS_APART + 1] = -np.inf
+        if taken:
+            order = np.argsort(at := np.concatenate([self.at, taken]))
+            more = self._own(self.clip, np.array(taken))
+            self.own, self.basis = (np.concatenate([x, more])[order] for x in (self.own, self.basis))
+            self.at = at[order]
+
+    def quiet(
+        self, seen: Float[np.ndarray, "looks pairs"], motion: Motion, share: float = NEARLY
+    ) -> Bool[np.ndarray, " pairs"]:
+        """The pairs that show no more than a share of the tolerance in any look at `motion`, of the solver's frames."""
+        return (seen <= self._passes(self.own, motion) + share * TOLERANCE).all(axis=0)
+
+    def _passes(self, own: Float[np.ndarray, "looks pairs"], motion: Motion) -> Float[np.ndarray, "looks pairs"]:
+        """The depth [m] that is none of the body's shape: what the reference shows in the frame or, within limits,
+        at ease."""
+        eased = np.stack([_half_raised(p, motion[self.at]) for p in self.pairs], axis=1)
+        return np.maximum(own, eased * (self.at_ease + SHOULDER_SLACK * TOLERANCE) - NEARLY * TOLERANCE)
+
+    def foresee(self, motion: Motion) -> None:
+        """Expect as much from now on as adapting `motion`, the result so far, once more would: the reference that
+        plays an adapted clip has its arms out and shows less overlap, which would pass for a violation."""
+        self.basis = np.minimum(self.basis, self._passes(self._own(motion, self.at), motion))
+
+    def joined(
+        self, excess: Float[np.ndarray, "frames pairs"], on_skin: Float[np.ndarray, "looks pairs"],
+        quiet: Bool[np.ndarray, " pairs"],
+    ) -> Float[np.ndarray, "frames pairs"]:  # fmt: skip
+        """Excess [m] on the fields or, in the looks, on the skin where that is more; 0 for quiet pairs."""
+        excess = excess.copy()
+        excess[self.at] = np.maximum(excess[self.at], on_skin)
+        return np.where(quiet, 0.0, excess)
 
     def beyond(
         self,
@@ -90,7 +134,7 @@ class SkinLooks:
         down from what the fields show there now: at an armpit a vertex is in by centimetres or out, so a step as
         large as the violation would overshoot. Between two looks the greater of them counts.
         """
-        over, shown = seen - self.own, excess[self.at]
+        over, shown = seen - self.basis, excess[self.at]
         if before is None:
             more = np.clip(np.where(seen > 0, over - shown, 0.0), 0.0, LOOK_STEP)
         else:
@@ -100,3 +144,18 @@ class SkinLooks:
             )
         after = np.searchsorted(self.at, self.frames)
         return np.maximum(more[after], more[np.maximum(after - 1, 0)])
+
+
+def _half_raised(pair: Pair, motion: Motion) -> Float[np.ndarray, " frames"]:
+    """Where the reference's overlap at ease may stand for its own in the frame, 0..1: at a shoulder for an arm that is
+    led away from the trunk somewhat, as in every adapted clip. An arm that hangs shows its overlap at ease anyway,
+    and for one that is raised, that of a hanging arm means nothing."""
+    if not pair.first.endswith("upper_arm"):
+        return np.ones(motion.frame_count)
+    skeleton, (positions, _) = motion.skeleton, host_kinematics(motion)
+    side = pair.first.partition("_")[0]
+    arm = positions[:, skeleton.joint(f"{side}_forearm")] - positions[:, skeleton.joint(f"{side}_upper_arm")]
+    down = positions[:, skeleton.joint("hips")] - positions[:, skeleton.joint("chest")]
+    cosine = (arm * down).sum(-1) / np.linalg.norm(arm, axis=-1) / np.linalg.norm(down, axis=-1)
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    return np.interp(angle, HALF_RAISED, (0.0, 1.0, 1.0, 0.0))

@@ -26,6 +26,7 @@ def adapt(
     blocks: Sequence[str] = BLOCKS,
     objective: str = "vertex",
     sweeps: int = 1,
+    start: Fit | None = None,
     progress: Progress | None = None,
 ) -> Fit:
     """Adapt a clip to the shape of a character.
@@ -34,6 +35,8 @@ def adapt(
     upper arms, forearms and hands out of the trunk and the thighs, the left arm first, `legs` the thighs and calves
     apart. Penetration counts as far as it exceeds what the same clip shows on `reference`, the body that it was made
     for; without one, on the character before `girth`, else in its rest pose.
+
+    `start` is an earlier fit of the same clip, to a body that is alike: the solver starts from its correction.
 
     The `Fit` holds the adapted motion, the correction, what each block did, and in `details` what the blocks
     measured: see `motionfit.adapt.limbs`.
@@ -47,7 +50,7 @@ def adapt(
     first = tuple(b for b in LIMBS if b in blocks)
     if first:
         fit = limbs(clip, character, reference=reference, blocks=first, objective=objective, sweeps=sweeps,
-                    progress=progress)  # fmt: skip
+                    start=start, progress=progress)  # fmt: skip
     else:
         fit = Fit(Correction((), ()), base, base, "converged", (), Problem(character, base, {}, ()))
     return fit
