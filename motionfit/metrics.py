@@ -84,7 +84,7 @@ def skin_depths(
     probed = max(sum(int(c.sum()) for c in counted.values()), 1)
     frames = np.arange(0, motion.frame_count, step)
     result, inside = np.zeros((len(frames), len(pairs))), 0
-    chunk = 64  # frames skinned at once: the whole clip would not fit for long clips
+    chunk = 16  # frames skinned at once: the whole clip would not fit for long clips
     for start in range(0, len(frames), chunk):
         some = frames[start : start + chunk]
         # always whole chunks, so that the skinning compiles once

@@ -26,7 +26,7 @@ from motionfit.terms.pose import Effort, Smoothness
 
 LIMBS = ("arms", "legs")
 
-SOLVE_RATE = 60.0  # [1/s] of the frames that the solver sees: between two of them a limb's depth changes by millimetres
+SOLVE_RATE = 30.0  # [1/s] of the frames that the solver sees: three for every knot
 KNOT_SPACING = 0.1  # [s]
 SOLVE_PROBES = {"upper_arm": 20, "forearm": 16, "hand": 12, "thigh": 20, "calf": 20}  # per pair, of those looked at
 ALLOWED_EXCESS = 0.004  # [m] that may stay where more was; well under TOLERANCE, which the skin is judged by

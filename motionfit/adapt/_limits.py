@@ -11,9 +11,9 @@ from motionfit.metrics import TOLERANCE, skin_depths
 from motionfit.shape.field import standing
 from motionfit.shape.pairs import Pair
 
-LEAST_LOOKS, LOOK_SHARE = 16, 1 / 30  # looks at the skin: at least, and per frame that the solver sees
+LEAST_LOOKS, LOOK_SHARE = 16, 1 / 15  # looks at the skin: at least, and per frame that the solver sees
 NEARLY = 0.9  # of TOLERANCE: what passes for no violation, since between two looks there may be a little more
-LOOKS_APART = 4  # [frames] that two looks are at least apart
+LOOKS_APART = 2  # [frames] that two looks are at least apart
 LOOK_STEP = 0.007  # [m]
 ENOUGH = 0.7  # of TOLERANCE: what a look may still show
 SHOULDER_SLACK = 1.25  # of the tolerance at the armpit, whose overlap at ease varies with the pose
@@ -66,16 +66,18 @@ class SkinLooks:
         self.frames = np.arange(clip.frame_count)
         count = min(clip.frame_count, max(LEAST_LOOKS, round(clip.frame_count * LOOK_SHARE)))
         self.at: Int[np.ndarray, " looks"] = np.unique(np.linspace(0, clip.frame_count - 1, count).round().astype(int))
-        self.own = self._own(clip, self.at)
+        self.own = self._own(clip, self.at, pairs)
         self.basis = self.own.copy()
         key = ("skin at ease", pairs)
         if key not in reference.memo:
             reference.memo[key] = skin_depths(reference, at_ease(reference), pairs).depth.min(axis=0)
         self.at_ease = reference.memo[key] * _adjacent(pairs)
 
-    def _own(self, motion: Motion, at: Int[np.ndarray, " some"]) -> Float[np.ndarray, "some pairs"]:
+    def _own(
+        self, motion: Motion, at: Int[np.ndarray, " some"], pairs: tuple[Pair, ...]
+    ) -> Float[np.ndarray, "some pairs"]:
         """What the reference shows playing a motion."""
-        return skin_depths(self.reference, onto(motion[at], self.reference.skeleton), self.pairs).depth
+        return skin_depths(self.reference, onto(motion[at], self.reference.skeleton), pairs).depth
 
     def depths(self, motion: Motion) -> Float[np.ndarray, "looks pairs"]:
         """Depth [m] per look and pair of a motion of the solver's frames."""
@@ -91,7 +93,7 @@ class SkinLooks:
             risk[max(taken[-1] - LOOKS_APART, 0) : taken[-1] + LOOKS_APART + 1] = -np.inf
         if taken:
             order = np.argsort(at := np.concatenate([self.at, taken]))
-            more = self._own(self.clip, np.array(taken))
+            more = self._own(self.clip, np.array(taken), self.pairs)
             self.own, self.basis = (np.concatenate([x, more])[order] for x in (self.own, self.basis))
             self.at = at[order]
 
@@ -110,7 +112,11 @@ class SkinLooks:
     def foresee(self, motion: Motion) -> None:
         """Expect as much from now on as adapting `motion`, the result so far, once more would: the reference that
         plays an adapted clip has its arms out and shows less overlap, which would pass for a violation."""
-        self.basis = np.minimum(self.basis, self._passes(self._own(motion, self.at), motion))
+        # of parts that do not meet at a joint, little enough is kept anyway
+        joined = _adjacent(self.pairs)
+        own = self.own.copy()
+        own[:, joined] = self._own(motion, self.at, tuple(p for p in self.pairs if p.adjacent))
+        self.basis = np.minimum(self.basis, self._passes(own, motion))
 
     def joined(
         self, excess: Float[np.ndarray, "frames pairs"], on_skin: Float[np.ndarray, "looks pairs"],
