@@ -23,7 +23,7 @@ from motionfit.feet import (
 )  # fmt: skip
 from motionfit.feet._cycles import adaptive_threshold, find_constraints
 from motionfit.feet._enforce import Chain, chain_effectors, chain_pose, descending_step, effector_path
-from motionfit.feet._leg import calm_feet
+from motionfit.feet._leg import _clearing, calm_feet
 from motionfit.metrics import derivative_ratio
 from tests.helpers import jumping, random_motion, with_legs
 
@@ -455,6 +455,36 @@ def test_root_method_on_every_clip(shared_data, male, folder):
             assert abs(np.angle((way @ [1, 1j]) / (source @ [1, 1j]), deg=True)) < 5, path.name
         if path.stem.startswith(("run", "16_36", "16_42", "16_01", "16_05")):
             assert (found.plants.labels == "none").any(), path.name
+
+
+def knee_accelerations(motion: mf.Motion) -> np.ndarray:
+    """Second differences of both knees' bend, in every frame."""
+    positions, joint = host_kinematics(motion)[0], motion.skeleton.joint
+    bends = []
+    for side in ("left", "right"):
+        hip, knee, ankle = (positions[:, joint(f"{side}_{r}")] for r in ("thigh", "calf", "foot"))
+        a, b = knee - hip, ankle - knee
+        bends.append(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(1)))
+    return np.abs(np.diff(bends, 2, axis=1))
+
+
+def test_a_swinging_foot_is_led_over_the_floor_without_a_kink():
+    time = np.arange(240) / 120
+    planted = (time < 0.5) | (time > 1.5)
+    tremor = 1e-3 * (-1.0) ** np.arange(240)
+    heights = np.where(planted, 0.0, tremor - 0.02 * np.sin(np.pi * (time - 0.5)) ** 2)
+    raised = _clearing(heights, planted, 1 / 120)
+    assert (raised[planted] == 0).all() and (heights + raised).min() > -3e-3
+    bounded = np.maximum(-heights, 0.0)  # what a bound in every frame would do
+    assert np.abs(np.diff(raised, 2)).max() < 0.1 * np.abs(np.diff(bounded, 2)).max()
+    assert not _clearing(np.abs(heights), planted, 1 / 120).any()
+
+
+def test_knees_do_not_snap_where_feet_land(shared_data, male):
+    for name in ("16_05_forward_jump", "16_36_run"):
+        found = mf.remove_footskate(mf.load_motion(shared_data / "bvh" / f"{name}.bvh"), male, "leg-ik")
+        after, before = (knee_accelerations(m) for m in (found.motion, found.base))
+        assert after.max() < 1.2 * before.max() and after.mean() < 1.2 * before.mean(), name
 
 
 @pytest.mark.slow
