@@ -22,7 +22,14 @@ from motionfit.feet import (
     sole_paths,
 )  # fmt: skip
 from motionfit.feet._cycles import adaptive_threshold, find_constraints
-from motionfit.feet._enforce import Chain, chain_effectors, chain_pose, descending_step, effector_path
+from motionfit.feet._enforce import (
+    Chain,
+    _keep_foot_length,
+    chain_effectors,
+    chain_pose,
+    descending_step,
+    effector_path,
+)
 from motionfit.feet._leg import _clearing, calm_feet
 from motionfit.metrics import derivative_ratio
 from tests.helpers import jumping, random_motion, with_legs
@@ -341,6 +348,31 @@ def test_adaptive_holds_heel_and_toe(body, request):
     ]
     fastest = np.linalg.norm(np.diff(host_kinematics(found.base)[0][:, feet], axis=0), axis=-1).max()
     assert jump[0] < jump[1] + 0.05 * fastest
+
+
+def test_a_heel_that_never_comes_down_is_not_held(average):
+    """On tiptoe (8) would still find a constraint for the heel, and put it on the floor."""
+    walk = samples.walk(cycles=3)
+    heels = [walk.skeleton.joint(f"{s}_foot") for s in ("left", "right")]
+    standing = np.asarray(bind_pose(walk.skeleton)[0][:, 1]) * 1.0
+    flat = find_constraints(walk, standing=standing)
+    assert flat == find_constraints(walk) and any(c.part == 0 for c in flat)
+    standing[heels] -= 0.08
+    assert all(c.part == 1 for c in find_constraints(walk, standing=standing))
+
+
+def test_an_ankle_that_gives_way_to_the_toe_is_back_where_its_own_hold_begins():
+    """The toe is released five frames before the heel is held: the ease-out is shorter, the ankle does not jump."""
+    frames = np.arange(60)
+    foot = np.tile([0.0, -0.05, 0.15], (60, 1))
+    ankle, toe = np.zeros((60, 3)), foot.copy()
+    toe[20:] += [0.02, 0.0, 0.02]
+    goals = [[(35, 59, ankle[0])], [(20, 29, toe[20])]]
+    own = ankle.copy()
+    _keep_foot_length(ankle, toe, goals, foot, 15)
+    moved = np.linalg.norm(ankle - own, axis=1)
+    assert moved[20:30].min() > 0.005 and (moved[35:] == 0).all()
+    assert np.abs(np.diff(moved[frames >= 29])).max() < 0.5 * moved[29]
 
 
 # --- measures ------------------------------------------------------------------------------------------------------------
