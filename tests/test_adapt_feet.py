@@ -11,6 +11,7 @@ import motionfit as mf
 from motionfit import samples
 from motionfit._control import Correction
 from motionfit._fit import Fit
+from motionfit._motion import joint_angles
 from motionfit.adapt import footskate, measure_standing, source_stance
 from motionfit.balance import balance_measures, sole_boxes, zmp_distance
 from motionfit.cli import main
@@ -72,13 +73,29 @@ def test_turned_legs_slide_no_more_than_the_source(body, request):
     np.testing.assert_allclose(again.motion.root, fit.motion.root, atol=1e-4)
 
 
+def test_legs_that_follow_their_feet_leave_the_root_and_the_balance(heavy):
+    base = mf.onto(samples.walk(cycles=3), heavy.skeleton)
+    turned = with_legs_apart(base, swing=0.04)
+    by_root, by_legs = (footskate(so_far(heavy, base, turned), heavy, legs=k).motion for k in (False, True))
+    stance = source_stance(heavy, base)
+    source, root, legs = (measure_standing(heavy, m, stance) for m in (base, by_root, by_legs))
+    assert legs["feet"]["slide_path_m"] < 1.1 * source["feet"]["slide_path_m"]
+    assert legs["feet"]["ground_penetration_max_m"] < source["feet"]["ground_penetration_max_m"] + MARGIN
+    assert legs["balance"]["zmp_distance_mean_m"] < 0.5 * root["balance"]["zmp_distance_mean_m"]
+    assert joint_angles(by_legs, turned).mean() < np.radians(1)
+    same = footskate(so_far(heavy, by_legs, by_legs), heavy, legs=True).motion
+    assert same.rotations is by_legs.rotations
+    np.testing.assert_allclose(same.root, by_legs.root, atol=1e-4)
+
+
 def test_short_clips_and_clips_in_the_air(average):
     walk = mf.onto(samples.walk(cycles=1), average.skeleton)
     rising = np.asarray(walk.root) + np.linspace(1, 30, walk.frame_count)[:, None] * [0.0, 1.0, 0.0]
     up = mf.Motion(walk.skeleton, rising, walk.rotations, walk.dt)
     for motion in (walk[:1], walk[:3], up):
-        fit = footskate(so_far(average, motion, with_legs_apart(motion)), average)
-        assert np.isfinite(np.asarray(fit.motion.root)).all()
+        for legs in (False, True):
+            fit = footskate(so_far(average, motion, with_legs_apart(motion)), average, legs=legs)
+            assert np.isfinite(np.asarray(fit.motion.root)).all() and np.isfinite(fit.motion.rotations).all()
 
 
 def test_the_block_runs_by_name(average):

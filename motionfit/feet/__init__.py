@@ -18,6 +18,7 @@ from motionfit.feet._detect import Evidence, detect, gather, least_moving
 from motionfit.feet._drift import keep_heights, keep_steps, stop_drift
 from motionfit.feet._enforce import effector_path
 from motionfit.feet._floor import Floor, fit_floor
+from motionfit.feet._follow import follow_feet
 from motionfit.feet._leg import hip_from_foot, hold_feet
 from motionfit.feet._plants import Footplants, Plant, load_labels, save_labels
 from motionfit.feet._remove import METHODS, FootFit, measure_feet, rows_of
@@ -28,7 +29,7 @@ from motionfit.feet._transfer import catmull_rom, cubic_roots, place_at, transfe
 __all__ = [
     "Constraint", "Evidence", "Floor", "FootFit", "Footplants", "METHODS", "Plant", "Sole", "adaptive_threshold",
     "catmull_rom", "cubic_roots", "detect", "dot_product", "effector_path", "find_constraints", "find_sole",
-    "fit_floor", "fixed_thresholds", "frame_heights", "gather", "hip_from_foot", "hold_feet", "horizontal_path",
+    "fit_floor", "fixed_thresholds", "follow_feet", "frame_heights", "gather", "hip_from_foot", "hold_feet", "horizontal_path",
     "keep_heights", "keep_steps", "least_moving", "load_labels", "measure_feet", "place_at", "root_steps", "rows_of", "save_labels", "scaled_heights",
     "sole_paths", "stop_drift", "transfer_instant", "vertical_scale",
 ]  # fmt: skip

@@ -111,7 +111,7 @@ def hold_feet(
             held[:, 1] = floor.at(held) - floor.height - level
             move[start : end + 1] = held
         if plants:
-            _pass_over(move, plants, dt)
+            pass_over(move, plants, dt)
             move[:, 1] += _clearing(lowest + move[:, 1], rows[:, foot] >= 0, dt)
     return moves
 
@@ -131,7 +131,7 @@ def _clearing(
     return raised * (3 * s**2 - 2 * s**3)
 
 
-def _pass_over(move: Float[np.ndarray, "frames 3"], plants: list[tuple[int, int]], dt: float) -> None:
+def pass_over(move: Float[np.ndarray, "frames 3"], plants: list[tuple[int, int]], dt: float) -> None:
     """Fill the frames between plants, in place: the smooth step 3s^2 - 2s^3 from one end to the other, plus what
     meets the speeds at both ends (the cubic Hermite polynomials of a slope) within the ease."""
     move[: plants[0][0]] = move[plants[0][0]]
