@@ -25,7 +25,7 @@ DRIFT = 0.01  # [m] a foot that drifts by less during a plant stands
 CALM = 0.3  # [s] between the knots of the drift's correction: with 0.1 s a turning run's mean ZMP distance went from 6
 # to 22 cm, with this it stays
 KNOTS = 0.1  # [s] between those of the height's: as calm as the controls of `motionfit.adapt`
-KINK = 0.04  # [s] within which the weight goes over from one foot to the other
+KINK = 0.04  # [s] within which the weight goes over from one foot to the other, twice
 LEVEL = 0.3  # weight of equal neighbouring knots, in frames with a foot down: it decides in flight only
 LOW = 0.02  # [m] a foot that much higher than the other one counts 1/e as much for the height
 DEEPER = 0.001  # [m] that a sole may go under the floor beyond the source's deepest
@@ -55,7 +55,7 @@ def keep_steps(
     carry_over_flights(moved, held, dt)
     # feet that were turned differently hand over with a kink
     width = 2 * max(1, round(0.5 * KINK / dt)) + 1
-    shift[1:] = np.cumsum(smooth(moved, width), axis=0)
+    shift[1:] = np.cumsum(smooth(smooth(moved, width), width), axis=0)
     return shift
 
 
