@@ -223,8 +223,11 @@ def host_kinematics(
 
 def bind_pose(skeleton: Skeleton) -> tuple[Float[np.ndarray, "joints 3"], Float[np.ndarray, "joints 4"]]:
     """World position [m] and rotation of every joint in the bind pose, on the host."""
-    positions, rotations = host_kinematics(rest_motion(skeleton))
-    return positions[0], rotations[0]
+    if "bind_pose" not in skeleton.memo:
+        positions, rotations = host_kinematics(rest_motion(skeleton))
+        skeleton.memo["bind_pose"] = positions[0], rotations[0]
+    positions, rotations = skeleton.memo["bind_pose"]
+    return positions.copy(), rotations.copy()
 
 
 def joint_angles(a: Motion, b: Motion) -> Float[np.ndarray, "frames joints"]:

@@ -219,8 +219,9 @@ class Skeleton(eqx.Module):
 
     def joint(self, role: str) -> int:
         """The joint of a role; an `InputError` names what is there when it is missing."""
-        self.require(role)
-        return self._joint_of_role[role]
+        if (joint := self._joint_of_role.get(role)) is None:
+            self.require(role)
+        return joint  # type: ignore
 
     def require(self, *roles: str) -> None:
         """Raise one `InputError` that names every missing role together with what was found."""

@@ -48,7 +48,7 @@ def adapt(
         str | None, typer.Option(help="PART=SCALE,… e.g. arms=1.3,trunk=1.5; one number grows all")
     ] = None,
     reference: Annotated[str | None, typer.Option(help="the body that the clip was made for")] = None,
-    blocks: Annotated[str, typer.Option(help="arms,legs in the order to run, or none")] = "arms,legs",
+    blocks: Annotated[str, typer.Option(help="some of arms,legs,footskate; all; or none")] = "all",
     objective: Annotated[str, typer.Option(help="vertex, capsule or joint")] = "vertex",
     fps: Annotated[float | None, typer.Option(help="resample the clip to this frame rate [1/s]")] = None,
     start: Annotated[float | None, typer.Option(help="cut the clip from here [s]")] = None,
@@ -72,13 +72,20 @@ def metrics(
     reference: Annotated[str | None, typer.Option(help="the body that the clip was made for")] = None,
     json_file: Annotated[pathlib.Path | None, typer.Option("--json", help="write the measures here")] = None,
 ) -> None:
-    """Measure CLIP on CHARACTER: penetration on volumes and skin, fidelity, smoothness."""
+    """Measure CLIP on CHARACTER: penetration on volumes and skin, feet, balance, fidelity, smoothness."""
     import motionfit as mf
     from motionfit._progress import progress_bar
 
     body, motion = mf.load_character(character), _load_clip(clip)
     source = motion if reference_clip is None else _load_clip(reference_clip)
+    if source.frame_count != motion.frame_count:
+        raise mf.InputError(f"{reference_clip} has {source.frame_count} frames, {clip} has {motion.frame_count}; give "
+                            "the clip that it was made from, cut and resampled alike")  # fmt: skip
     other = None if reference is None else mf.load_character(reference)
+    if other is not None and reference_clip is None:
+        sys.stderr.write(f"motionfit: {reference} plays {clip} itself; if that is an adapted clip, add "
+                         "--reference-clip and the clip that it was made from, or what it was adapted away from "
+                         "is missing in the reference\n")  # fmt: skip
     with progress_bar() as progress:
         measured = _measure_all(body, {"clip": mf.onto(motion, body.skeleton)}, mf.onto(source, body.skeleton),
                                 source, other, progress)["clip"]  # fmt: skip
@@ -161,7 +168,7 @@ def footskate(
 
 def run_adapt(
     clip: str, character: str, *, out: pathlib.Path, girth: str | None = None, reference: str | None = None,
-    blocks: str = "arms,legs", objective: str = "vertex", fps: float | None = None, start: float | None = None,
+    blocks: str = "all", objective: str = "vertex", fps: float | None = None, start: float | None = None,
     end: float | None = None, unit: float | None = None, up: str | None = None, roles: pathlib.Path | None = None,
     report: pathlib.Path | None = None, plot: pathlib.Path | None = None,
 ) -> None:  # fmt: skip
@@ -179,7 +186,8 @@ def run_adapt(
     for target in (out, report, plot):
         if target is not None and not target.parent.is_dir():
             raise InputError(f"{target}: its folder does not exist; make it first: mkdir -p {target.parent}")
-    names = () if blocks.strip() == "none" else tuple(b.strip() for b in blocks.split(",") if b.strip())
+    whole = {"none": (), "all": mf.adapt.BLOCKS}
+    names = whole.get(blocks.strip(), tuple(b.strip() for b in blocks.split(",") if b.strip()))
     scales = parse_girth(girth) if girth else {}
     started = time.perf_counter()
     motion = _load_clip(clip, unit=unit, up=up, roles=roles, start=start, end=end, fps=fps)
@@ -220,8 +228,10 @@ def run_adapt(
     if plot is not None:
         from motionfit.view import report_picture
 
+        slides = [measured[k]["feet"]["slide_path_m"] for k in ("before", "after")]
+        feet = "" if None in slides else ", planted feet slide {:.0f} -> {:.0f} cm".format(*(100 * s for s in slides))
         report_picture(plot, body, base, motions["after"], excess["before"], excess["after"], pairs,
-                       f"{clip} on {body.name}: {status.replace('_', ' ')}")  # fmt: skip
+                       f"{clip} on {body.name}: {status.replace('_', ' ')}{feet}")  # fmt: skip
     _print_table(measured)
     typer.echo(
         f"{status.replace('_', ' ')} in {total:.1f} s; wrote " + ", ".join(str(p) for p in (out, report, plot) if p)
@@ -270,7 +280,7 @@ class _CompileClock:
 def _measure_all(body, motions: dict, source, clip, reference, progress) -> dict[str, dict]:
     """An M of report.json per motion; `_excess` holds the excess depths on the volumes for the picture."""
     import motionfit as mf
-    from motionfit.adapt import build_clearance, reference_depths, volume_depths
+    from motionfit.adapt import build_clearance, measure_standing, reference_depths, source_stance, volume_depths
     from motionfit.metrics import measure, skin_depths
 
     pairs = mf.shape.PAIRS
@@ -279,11 +289,11 @@ def _measure_all(body, motions: dict, source, clip, reference, progress) -> dict
     # about 30 looks per second at the skin: what a limb does between two of them is under a millimetre deep
     some = next(iter(motions.values()))
     step = max(1, round(some.frame_rate / 30))
-    own = None
+    own = original = None
     if reference is not None:
-        own = skin_depths(
-            reference, mf.onto(clip, reference.skeleton), step=step, progress=progress.task("reference skin")
-        )
+        original = mf.onto(clip, reference.skeleton)
+        own = skin_depths(reference, original, step=step, progress=progress.task("reference skin"))
+    stance = source_stance(body, source, reference, original)
     result = {}
     for name, motion in motions.items():
         excess = volume_depths(clearance, motion) - limit
@@ -292,7 +302,8 @@ def _measure_all(body, motions: dict, source, clip, reference, progress) -> dict
             result[name] = json.loads(json.dumps({k: v for k, v in result[same].items() if k != "_excess"}))
         else:
             skin = skin_depths(body, motion, step=step, progress=progress.task(f"skin {name}"))
-            result[name] = measure(motion, source, volume_excess=excess, skin=skin, reference=own)
+            result[name] = measure(motion, source, volume_excess=excess, skin=skin, reference=own,
+                                   **measure_standing(body, motion, stance))  # fmt: skip
         result[name]["_excess"] = excess
     return result
 
@@ -323,7 +334,7 @@ def _print_table(columns: dict[str, dict]) -> None:
     for name in columns:
         table.add_column(name, justify="right")
 
-    def line(label: str, *path: str, scale: float = 1.0, form: str = "{:.1f}") -> None:
+    def line(label: str, *path: str, scale: float | int = 1, form: str = "{:.1f}") -> None:
         cells = []
         for m in columns.values():
             value = m
@@ -337,6 +348,10 @@ def _print_table(columns: dict[str, dict]) -> None:
     line("deepest excess, skin (cm)", "penetration", "skin", "excess_max_m", scale=100)
     line("frames over 1 cm, skin (%)", "penetration", "skin", "frames_over_1cm", scale=100)
     line("skin inside other parts (%)", "penetration", "skin", "inside_ratio", scale=100, form="{:.2f}")
+    line("planted foot slides, in all (cm)", "feet", "slide_path_m", scale=100)
+    line("deepest under the floor (cm)", "feet", "ground_penetration_max_m", scale=100)
+    line("ZMP from its support, mean (cm)", "balance", "zmp_distance_mean_m", scale=100)
+    line("beyond the reference's, mean (cm)", "balance", "excess_over_reference_mean_m", scale=100)
     line("mean joint deviation (deg)", "fidelity", "joint_angle_mean_rad", scale=180 / math.pi, form="{:.2f}")
     line("forearm direction (deg)", "fidelity", "forearm_direction_mean_rad", scale=180 / math.pi)
     line("jerk ratio", "smoothness", "jerk_ratio", form="{:.3f}")

@@ -178,11 +178,13 @@ def measure(
     skin: SkinDepths | None = None,
     reference: SkinDepths | None = None,
     pairs: Sequence[Pair] = PAIRS,
+    feet: dict | None = None,
+    balance: dict | None = None,
 ) -> dict:
     """One M of report.json (schema 1): penetration on volumes and skin, fidelity and smoothness against `source`.
 
     `volume_excess` [m] per frame and pair comes from `motionfit.adapt.volume_depths`, `skin` and `reference` from
-    `skin_depths`. Feet and balance are null: they are measured by the parts of motionfit that treat them.
+    `skin_depths`, `feet` and `balance` from `motionfit.adapt.measure_standing`. What is not given is null.
     """
     penetration: dict = {"excess_max_m": None, "excess_mean_m": None, "frames_over_1cm": None, "pairs": {}}
     if volume_excess is not None:
@@ -200,10 +202,10 @@ def measure(
     mean, worst = joint_angle_deviation(motion, source)
     return {
         "penetration": penetration,
-        "feet": dict.fromkeys(("slide_max_m_s", "slide_p95_m_s", "slide_path_m", "contact_frames",
-                               "ground_penetration_max_m", "floating_max_m")),
-        "balance": dict.fromkeys(("zmp_distance_mean_m", "zmp_distance_sd_m", "excess_over_reference_mean_m",
-                                  "supported_frames")),
+        "feet": feet or dict.fromkeys(("slide_max_m_s", "slide_p95_m_s", "slide_path_m", "contact_frames",
+                                       "ground_penetration_max_m", "floating_max_m")),
+        "balance": balance or dict.fromkeys(("zmp_distance_mean_m", "zmp_distance_sd_m", "excess_over_reference_mean_m",
+                                             "supported_frames")),
         "fidelity": {
             "joint_angle_mean_rad": mean,
             "joint_angle_max_rad": worst,

@@ -43,6 +43,7 @@ def test_heavy_body_comes_clean_and_stays_itself(fitted, heavy, average):
 def test_adapting_again_changes_nearly_nothing(fitted, heavy, average):
     again = mf.adapt(fitted.motion, heavy, reference=average)
     assert joint_angles(again.motion, fitted.motion).max() < np.deg2rad(0.1)
+    assert np.abs(np.asarray(again.motion.root) - np.asarray(fitted.motion.root)).max() < 1e-4
 
 
 def test_a_clip_that_penetrates_nothing_comes_back(average):
@@ -64,7 +65,7 @@ def test_other_objectives_run_and_report(objective, heavy, average):
     report = fit.report()
     assert report["status"] in ("converged", "violations_left", "no_progress")
     assert np.isfinite(np.asarray(fit.motion.rotations)).all()
-    assert {b["name"] for b in report["blocks"]} == {"left_arm", "right_arm", "legs"}
+    assert {b["name"] for b in report["blocks"]} == {"left_arm", "right_arm", "legs", "footskate"}
 
 
 def test_demo_writes_what_it_promises(tmp_path):
@@ -76,6 +77,10 @@ def test_demo_writes_what_it_promises(tmp_path):
     assert report["before"]["penetration"]["skin"]["frames_over_1cm"] > 0.9
     assert report["after"]["penetration"]["skin"]["frames_over_1cm"] <= 0.02
     assert report["after"]["smoothness"]["jerk_ratio"] <= 1.05
+    before, after = (report[k]["feet"] for k in ("before", "after"))
+    assert after["slide_path_m"] <= 1.1 * before["slide_path_m"]
+    assert after["ground_penetration_max_m"] <= before["ground_penetration_max_m"] + 0.002
+    assert report["after"]["balance"]["supported_frames"] > 0
     assert (tmp_path / "demo" / "report.png").read_bytes()[:4] == b"\x89PNG"
     body = mf.load_character(tmp_path / "demo" / "adapted.glb")
     assert mf.load_motion(tmp_path / "demo" / "adapted.glb").frame_count == report["frames"]

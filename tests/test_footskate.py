@@ -22,8 +22,15 @@ from motionfit.feet import (
     sole_paths,
 )  # fmt: skip
 from motionfit.feet._cycles import adaptive_threshold, find_constraints
-from motionfit.feet._enforce import Chain, chain_effectors, chain_pose, descending_step, effector_path
-from motionfit.feet._leg import calm_feet
+from motionfit.feet._enforce import (
+    Chain,
+    _keep_foot_length,
+    chain_effectors,
+    chain_pose,
+    descending_step,
+    effector_path,
+)
+from motionfit.feet._leg import _clearing, calm_feet
 from motionfit.metrics import derivative_ratio
 from tests.helpers import jumping, random_motion, with_legs
 
@@ -343,6 +350,31 @@ def test_adaptive_holds_heel_and_toe(body, request):
     assert jump[0] < jump[1] + 0.05 * fastest
 
 
+def test_a_heel_that_never_comes_down_is_not_held(average):
+    """On tiptoe (8) would still find a constraint for the heel, and put it on the floor."""
+    walk = samples.walk(cycles=3)
+    heels = [walk.skeleton.joint(f"{s}_foot") for s in ("left", "right")]
+    standing = np.asarray(bind_pose(walk.skeleton)[0][:, 1]) * 1.0
+    flat = find_constraints(walk, standing=standing)
+    assert flat == find_constraints(walk) and any(c.part == 0 for c in flat)
+    standing[heels] -= 0.08
+    assert all(c.part == 1 for c in find_constraints(walk, standing=standing))
+
+
+def test_an_ankle_that_gives_way_to_the_toe_is_back_where_its_own_hold_begins():
+    """The toe is released five frames before the heel is held: the ease-out is shorter, the ankle does not jump."""
+    frames = np.arange(60)
+    foot = np.tile([0.0, -0.05, 0.15], (60, 1))
+    ankle, toe = np.zeros((60, 3)), foot.copy()
+    toe[20:] += [0.02, 0.0, 0.02]
+    goals = [[(35, 59, ankle[0])], [(20, 29, toe[20])]]
+    own = ankle.copy()
+    _keep_foot_length(ankle, toe, goals, foot, 15)
+    moved = np.linalg.norm(ankle - own, axis=1)
+    assert moved[20:30].min() > 0.005 and (moved[35:] == 0).all()
+    assert np.abs(np.diff(moved[frames >= 29])).max() < 0.5 * moved[29]
+
+
 # --- measures ------------------------------------------------------------------------------------------------------------
 
 
@@ -455,6 +487,36 @@ def test_root_method_on_every_clip(shared_data, male, folder):
             assert abs(np.angle((way @ [1, 1j]) / (source @ [1, 1j]), deg=True)) < 5, path.name
         if path.stem.startswith(("run", "16_36", "16_42", "16_01", "16_05")):
             assert (found.plants.labels == "none").any(), path.name
+
+
+def knee_accelerations(motion: mf.Motion) -> np.ndarray:
+    """Second differences of both knees' bend, in every frame."""
+    positions, joint = host_kinematics(motion)[0], motion.skeleton.joint
+    bends = []
+    for side in ("left", "right"):
+        hip, knee, ankle = (positions[:, joint(f"{side}_{r}")] for r in ("thigh", "calf", "foot"))
+        a, b = knee - hip, ankle - knee
+        bends.append(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(1)))
+    return np.abs(np.diff(bends, 2, axis=1))
+
+
+def test_a_swinging_foot_is_led_over_the_floor_without_a_kink():
+    time = np.arange(240) / 120
+    planted = (time < 0.5) | (time > 1.5)
+    tremor = 1e-3 * (-1.0) ** np.arange(240)
+    heights = np.where(planted, 0.0, tremor - 0.02 * np.sin(np.pi * (time - 0.5)) ** 2)
+    raised = _clearing(heights, planted, 1 / 120)
+    assert (raised[planted] == 0).all() and (heights + raised).min() > -3e-3
+    bounded = np.maximum(-heights, 0.0)  # what a bound in every frame would do
+    assert np.abs(np.diff(raised, 2)).max() < 0.1 * np.abs(np.diff(bounded, 2)).max()
+    assert not _clearing(np.abs(heights), planted, 1 / 120).any()
+
+
+def test_knees_do_not_snap_where_feet_land(shared_data, male):
+    for name in ("16_05_forward_jump", "16_36_run"):
+        found = mf.remove_footskate(mf.load_motion(shared_data / "bvh" / f"{name}.bvh"), male, "leg-ik")
+        after, before = (knee_accelerations(m) for m in (found.motion, found.base))
+        assert after.max() < 1.2 * before.max() and after.mean() < 1.2 * before.mean(), name
 
 
 @pytest.mark.slow

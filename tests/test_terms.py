@@ -51,6 +51,7 @@ def _terms(character, motion):
     yield "rotation-tracking", mf.terms.RotationTracking(hand, np.asarray(kin.rotations_world[:, hand]), 0.1)
     yield "effort", mf.terms.Effort(np.array([0.5, 1.0, 2.0]))
     yield "smoothness", mf.terms.Smoothness(5.0)
+    yield "steadiness", mf.terms.Steadiness(np.array([0.5, 1.0, np.inf]))
     yield "robust", mf.Robust(mf.terms.Effort(0.01), 2.0)
     yield "during", mf.During(mf.terms.Smoothness(5.0), np.linspace(0, 1, frames))
     yield "custom", mf.Custom(_level, 0.9)

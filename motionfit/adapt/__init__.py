@@ -4,23 +4,17 @@ import sys
 import types
 
 from motionfit.adapt._clearance import OBJECTIVES, build_clearance, volume_depths
+from motionfit.adapt._feet import footskate
 from motionfit.adapt._limbs import limbs
 from motionfit.adapt._limits import reference_depths
 from motionfit.adapt._many import adapt_many
 from motionfit.adapt._procedure import BLOCKS, adapt, arms, legs
+from motionfit.adapt._standing import measure_standing, source_stance
 
 __all__ = [
-    "BLOCKS",
-    "OBJECTIVES",
-    "adapt",
-    "adapt_many",
-    "arms",
-    "build_clearance",
-    "legs",
-    "limbs",
-    "reference_depths",
-    "volume_depths",
-]
+    "BLOCKS", "OBJECTIVES", "adapt", "adapt_many", "arms", "build_clearance", "footskate", "legs", "limbs",
+    "measure_standing", "reference_depths", "source_stance", "volume_depths",
+]  # fmt: skip
 
 
 class _CallableModule(types.ModuleType):

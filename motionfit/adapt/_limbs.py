@@ -22,7 +22,7 @@ from motionfit.adapt._limits import ENOUGH, SkinLooks, reference_depths
 from motionfit.metrics import TOLERANCE, derivative_ratio
 from motionfit.shape.pairs import Pair, pairs_of
 from motionfit.splines import Basis, bspline_basis
-from motionfit.terms.pose import Effort, Smoothness
+from motionfit.terms.pose import Effort, Smoothness, Steadiness
 
 LIMBS = ("arms", "legs")
 
@@ -38,6 +38,7 @@ SIGMA_EFFORT = {
     "hip_turn": 0.1,
     "thighs_apart": 1.0,
 }  # [rad]
+SIGMA_PACE = {"hip_turn": 0.3, "thighs_apart": 0.3}  # [rad/s]: a stance may widen over seconds, not within a step
 JERK_SHARE = 4.0  # of the hands' own jerk, what the correction may add at the cost of 1 per frame
 LEVER = 0.5  # [m] shoulder to hand
 LEAST_JERK = 30.0  # [m/s^3] for clips that stand still
@@ -255,7 +256,8 @@ def _stages(
         for name, controls, mine in wanted:
             clearance = build_clearance(character, mine, objective)
             columns = [pairs.index(p) for p in clearance.pairs]
-            terms = (f"{name}_clearance", "effort", "smoothness")
+            # a foot that stands shall not slide; arms may come and go
+            terms = (f"{name}_clearance", "effort", "smoothness", *(("steadiness",) if recipe == "legs" else ()))
             block = Block(name, controls, terms, max_steps=24, tolerance=1e-3)
             made.append(Stage(block, clearance, columns, allowed[:, columns], quiet[columns]))
     return made
@@ -284,6 +286,8 @@ def _problem(
     effort = Effort(np.array([SIGMA_EFFORT[c.name] for c in seen.controls]))
     terms["effort"] = During(effort, (frames < real).astype(float))
     terms["smoothness"] = During(Smoothness(smooth), (frames < real - 2).astype(float))
+    steady = Steadiness(np.array([SIGMA_PACE.get(c.name, np.inf) for c in seen.controls]))
+    terms["steadiness"] = During(steady, (frames < real - 1).astype(float))
     return Problem(character, seen.padded, terms, seen.controls)
 
 

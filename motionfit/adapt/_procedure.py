@@ -9,12 +9,13 @@ from motionfit._motion import Motion
 from motionfit._onto import onto
 from motionfit._problem import Problem
 from motionfit._types import InputError
+from motionfit.adapt._feet import footskate
 from motionfit.adapt._limbs import LIMBS, limbs
 from motionfit.shape.growth import grow
 
 Progress = Callable[[str, int, int], None]
 
-BLOCKS = (*LIMBS,)
+BLOCKS = (*LIMBS, "footskate")
 
 
 def adapt(
@@ -33,8 +34,9 @@ def adapt(
 
     The clip is put on the character (`motionfit.onto`), then the blocks run in the order of thesis 5.2: `arms` keeps
     upper arms, forearms and hands out of the trunk and the thighs, the left arm first, `legs` the thighs and calves
-    apart. Penetration counts as far as it exceeds what the same clip shows on `reference`, the body that it was made
-    for; without one, on the character before `girth`, else in its rest pose.
+    apart, `footskate` the planted feet where they are, by the root alone. Penetration counts as far as it exceeds
+    what the same clip shows on `reference`, the body that it was made for; without one, on the character before
+    `girth`, else in its rest pose.
 
     `start` is an earlier fit of the same clip, to a body that is alike: the solver starts from its correction.
 
@@ -53,6 +55,8 @@ def adapt(
                     start=start, progress=progress)  # fmt: skip
     else:
         fit = Fit(Correction((), ()), base, base, "converged", (), Problem(character, base, {}, ()))
+    if "footskate" in blocks:
+        fit = footskate(fit, character)
     return fit
 
 

@@ -15,11 +15,13 @@ Thalmann 2006.
 from motionfit.feet._classics import dot_product, fixed_thresholds
 from motionfit.feet._cycles import Constraint, adaptive_threshold, find_constraints
 from motionfit.feet._detect import Evidence, detect, gather, least_moving
+from motionfit.feet._drift import keep_heights, keep_steps, stop_drift
 from motionfit.feet._enforce import effector_path
 from motionfit.feet._floor import Floor, fit_floor
+from motionfit.feet._follow import follow_feet
 from motionfit.feet._leg import hip_from_foot, hold_feet
 from motionfit.feet._plants import Footplants, Plant, load_labels, save_labels
-from motionfit.feet._remove import METHODS, FootFit, measure_feet
+from motionfit.feet._remove import METHODS, FootFit, measure_feet, rows_of
 from motionfit.feet._root import frame_heights, horizontal_path, root_steps, scaled_heights, vertical_scale
 from motionfit.feet._sole import Sole, find_sole, sole_paths
 from motionfit.feet._transfer import catmull_rom, cubic_roots, place_at, transfer_instant
@@ -27,7 +29,7 @@ from motionfit.feet._transfer import catmull_rom, cubic_roots, place_at, transfe
 __all__ = [
     "Constraint", "Evidence", "Floor", "FootFit", "Footplants", "METHODS", "Plant", "Sole", "adaptive_threshold",
     "catmull_rom", "cubic_roots", "detect", "dot_product", "effector_path", "find_constraints", "find_sole",
-    "fit_floor", "fixed_thresholds", "frame_heights", "gather", "hip_from_foot", "hold_feet", "horizontal_path",
-    "least_moving", "load_labels", "measure_feet", "place_at", "root_steps", "save_labels", "scaled_heights",
-    "sole_paths", "transfer_instant", "vertical_scale",
+    "fit_floor", "fixed_thresholds", "follow_feet", "frame_heights", "gather", "hip_from_foot", "hold_feet", "horizontal_path",
+    "keep_heights", "keep_steps", "least_moving", "load_labels", "measure_feet", "place_at", "root_steps", "rows_of", "save_labels", "scaled_heights",
+    "sole_paths", "stop_drift", "transfer_instant", "vertical_scale",
 ]  # fmt: skip

@@ -24,6 +24,7 @@ CYCLE = 25  # frames of the source's normalised cycle
 BOUNDS = {"walk": ((1, 12), (3, 15)), "run": ((1, 7), (1, 9))}
 CORRECTNESS = 0.4  # delta of (8)
 NOISE = 0.01  # [m] by which the height of a joint varies while its foot stands
+RAISED = 0.04  # [m] for an adult's leg
 RUNNING = 0.5  # Froude number v^2 / g L from which people run (Alexander 1989)
 
 
@@ -81,6 +82,7 @@ def find_constraints(
     floor: Floor | None = None,
     *,
     plants: Sequence[Plant] = (),
+    standing: Float[np.ndarray, " joints"] | None = None,
     correctness: float = CORRECTNESS,
 ) -> list[Constraint]:
     """Ankle and toe constraints of both feet by the adaptive threshold, without a kind of motion named.
@@ -88,12 +90,15 @@ def find_constraints(
     Each strike opens the bounding frames of table 1 for its foot, scaled to the length of the cycle around it;
     walking or running is told by the Froude number. A clip without strikes (standing, a jump) is one interval, as
     far as nothing better is known: `plants` keep the bounding frames within the foot's own plants, and one that no
-    strike explains bounds an interval of its own.
+    strike explains bounds an interval of its own. (8) finds a constraint wherever it is asked to: where `standing` says
+    how high [m] over the floor each joint is in a foot that stands flat, a joint that stays `RAISED` above that (a
+    heel on tiptoe, or at the end of the clip) has none.
     """
     floor = floor or Floor()
     frames, joints = motion.frame_count, foot_joints(motion.skeleton)
     world = chain_kinematics(motion, tuple(j for foot in joints for j in foot))
     heights = [[floor.above(world[j][1]) for j in foot] for foot in joints]
+    most = None if standing is None else np.asarray(standing) + RAISED * leg_scale(motion.skeleton)
     moments = strikes(motion)
     constraints: list[Constraint] = []
 
@@ -103,8 +108,11 @@ def find_constraints(
         if own:
             best = max(own, key=lambda p: min(p.end, last) - max(p.start, first))
             first, last = max(first, best.start), min(last, best.end)
-        if first <= last:
-            a, b = adaptive_threshold(heights[foot][part][first : last + 1], correctness)
+        if first > last:
+            return
+        mine = heights[foot][part][first : last + 1]
+        if most is None or mine.min() < most[joints[foot][part]]:
+            a, b = adaptive_threshold(mine, correctness)
             constraints.append(Constraint(foot, part, first + a, first + b))
 
     if len(moments) < 2:

@@ -71,13 +71,15 @@ def velocity(x: Float[np.ndarray, "frames *rest"], dt: float) -> Float[np.ndarra
 
 def leg_scale(skeleton: Skeleton) -> float:
     """Leg length in adult legs, from the offsets of the joints between hip and ankle."""
-    offsets, total = np.asarray(skeleton.offsets, float), 0.0
-    for side in SIDES:
-        joint, top = skeleton.joint(f"{side}_foot"), skeleton.joint(f"{side}_thigh")
-        while joint not in (top, -1):
-            total += float(np.linalg.norm(offsets[joint]))
-            joint = skeleton.parents[joint]
-    return max(total / 2, 0.01) / ADULT_LEG
+    if "leg_scale" not in skeleton.memo:
+        lengths, total = np.linalg.norm(np.asarray(skeleton.offsets, float), axis=1), 0.0
+        for side in SIDES:
+            joint, top = skeleton.joint(f"{side}_foot"), skeleton.joint(f"{side}_thigh")
+            while joint not in (top, -1):
+                total += float(lengths[joint])
+                joint = skeleton.parents[joint]
+        skeleton.memo["leg_scale"] = max(total / 2, 0.01) / ADULT_LEG
+    return skeleton.memo["leg_scale"]
 
 
 def gather(

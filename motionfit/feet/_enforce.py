@@ -153,8 +153,8 @@ def enforce(
         rise = target.at(positions[:, 0]) - plants.floor.at(positions[:, 0])
         positions = positions + np.array([0.0, 1.0, 0.0]) * rise[:, None, None]
     joints = foot_joints(skeleton)
-    constraints = find_constraints(base, plants.floor, plants=plants.plants)
     standing = bind_pose(skeleton)[0][:, 1] - sole_paths(sole, rest_motion(skeleton))[0, :, 1].min()
+    constraints = find_constraints(base, plants.floor, plants=plants.plants, standing=standing)
     ease = max(1, round(EASE / dt))
     paths, goals = [], []
     for side, mine in enumerate(joints):
@@ -238,8 +238,12 @@ def _keep_foot_length(ankle: np.ndarray, toe: np.ndarray, goals: list[list[Goal]
             mask[start : end + 1] = True
     share = np.zeros(len(ankle))
     for start, end, _ in goals[1]:
-        into = (start - frames) / ease if not held[0][start] else np.where(frames < start, 1.0, 0.0)
-        share = np.maximum(share, descending_step(np.maximum(np.maximum(into, (frames - end) / ease), 0.0)))
+        # where a heel is held again before an ease is over there is less time: it does not wait for the ankle
+        before = max([b for _, b, _ in goals[0] if b < start], default=-ease)
+        after = min([a for a, _, _ in goals[0] if a > end], default=len(ankle) + ease)
+        into, out = min(ease, start - before), min(ease, after - end)
+        early = (start - frames) / into if not held[0][start] else np.where(frames < start, 1.0, 0.0)
+        share = np.maximum(share, descending_step(np.maximum(np.maximum(early, (frames - end) / out), 0.0)))
     share[held[0]] = 0.0
 
     def away() -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import maximum_filter1d
+from scipy.ndimage import distance_transform_edt, gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation
 
 from motionfit._motion import Motion, bind_pose, host_kinematics
@@ -24,7 +24,8 @@ from motionfit.ik import move_limb
 
 CALM = 0.25  # [s] over which the root's correction is averaged, twice: the legs take the rest
 EASE = 0.12  # [s] within which a foot comes to rest and leaves again
-EVEN = 0.1  # [s] over which the height of a standing sole is averaged: its noise would go to the knee
+EVEN = 0.1  # [s] sigma over which the height of a standing sole is averaged: its noise would go to the knee, and a
+# foot that is still coming down when its plant begins comes to rest as it did, instead of at once
 TREMOR = 0.06  # [s] over which the rotation of a standing foot is averaged
 EXACT = 1e-9  # [m] to which the vertices that stand are brought to their places
 STRETCH = 0.99  # of a leg's length: near the end the knee turns by degrees for a millimetre at the foot
@@ -90,10 +91,11 @@ def hold_feet(
     """How far [m] each foot must move in each frame so that it stands still, on the floor, while it is planted.
 
     In a plant the vertex stood on keeps its horizontal place (chosen so that the foot moves as little as possible on
-    the whole) and the foot's lowest vertex, its height averaged over a moment, is on the floor. Between two plants the move goes over from one to the
-    other, with the speeds that the foot needs to come to rest, and a swinging sole does not go under the floor.
+    the whole) and the foot's lowest vertex, its height averaged over a moment, is on the floor. Between two plants the
+    move goes over from one to the other, with the speeds that the foot needs to come to rest, and a swinging sole is
+    led over the floor.
     """
-    frames, even = len(paths), 2 * round(EVEN / dt / 2) + 1
+    frames = len(paths)
     moves = np.zeros((frames, 2, 3))
     for foot in (0, 1):
         mine = sole.of(foot)
@@ -105,16 +107,31 @@ def hold_feet(
         for start, end in plants:
             held = np.concatenate([np.zeros((1, 3)), np.cumsum(steps[start:end], axis=0)])
             held -= held.mean(0)
-            held[:, 1] = floor.at(held) - floor.height - smooth(lowest[start : end + 1], even)
+            level = gaussian_filter1d(lowest[start : end + 1], EVEN / dt, mode="nearest")
+            held[:, 1] = floor.at(held) - floor.height - level
             move[start : end + 1] = held
         if plants:
-            _pass_over(move, plants, dt)
-            air = rows[:, foot] < 0
-            move[air, 1] = np.maximum(move[air, 1], -lowest[air])
+            pass_over(move, plants, dt)
+            move[:, 1] += _clearing(lowest + move[:, 1], rows[:, foot] >= 0, dt)
     return moves
 
 
-def _pass_over(move: Float[np.ndarray, "frames 3"], plants: list[tuple[int, int]], dt: float) -> None:
+def _clearing(
+    heights: Float[np.ndarray, " frames"], planted: Bool[np.ndarray, " frames"], dt: float
+) -> Float[np.ndarray, " frames"]:
+    """How much [m] a swinging foot is raised so that it does not go under the floor: as a smooth curve over what each
+    frame asks for, which ends where the foot is planted. A bound in every frame would be a knee's snap."""
+    needed = np.where(planted, 0.0, np.maximum(-heights, 0.0))
+    if not needed.any():
+        return needed
+    width = 2 * max(1, round(0.5 * EASE / dt)) + 1
+    raised = smooth(smooth(maximum_filter1d(needed, 2 * width - 1, mode="nearest"), width), width)
+    near = distance_transform_edt(~planted) if planted.any() else np.full(len(planted), np.inf)
+    s = np.clip(near * dt / EASE, 0.0, 1.0)
+    return raised * (3 * s**2 - 2 * s**3)
+
+
+def pass_over(move: Float[np.ndarray, "frames 3"], plants: list[tuple[int, int]], dt: float) -> None:
     """Fill the frames between plants, in place: the smooth step 3s^2 - 2s^3 from one end to the other, plus what
     meets the speeds at both ends (the cubic Hermite polynomials of a slope) within the ease."""
     move[: plants[0][0]] = move[plants[0][0]]

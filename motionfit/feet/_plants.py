@@ -49,6 +49,12 @@ class Footplants(eqx.Module):
         return np.array(LABELS)[self.planted @ np.array([1, 2])]
 
     @property
+    def carrier(self) -> Int[np.ndarray, " frames"]:
+        """The vertex of the mesh that carries the character, -1 in flight."""
+        frames = np.arange(len(self.primary))
+        return np.where(self.primary >= 0, self.vertex[frames, np.maximum(self.primary, 0)], -1)
+
+    @property
     def plants(self) -> tuple[Plant, ...]:
         """The intervals in which a foot stays down, by start. A vertex is named where it is one throughout."""
         found = []

@@ -210,7 +210,7 @@ def remove_footskate(
     target, rows = _as_floor(floor), rows_of(sole, plants.vertex)
     paths, speed = evidence.paths_world, evidence.speed
     if method == "root":
-        result, details = _root(base, sole, plants, paths, rows, speed, target, vertical)
+        result, details = _root(base, sole, plants, paths, speed, target, vertical)
         reachable = np.ones_like(plants.planted)
     elif method == "leg-ik":
         result, reachable, details = with_leg_ik(base, sole, plants, paths, rows, speed, target, lift)
@@ -224,11 +224,10 @@ def remove_footskate(
     return FootFit(result, base, plants, method, reachable, details, sole)
 
 
-def _root(base: Motion, sole, plants, paths, rows, speed, target, vertical) -> tuple[Motion, dict[str, float]]:
+def _root(base: Motion, sole, plants, paths, speed, target, vertical) -> tuple[Motion, dict[str, float]]:
     """The root method: the motion, and the offset [m] and scale of its heights."""
     frames, root = np.arange(base.frame_count), np.asarray(base.root, float)
-    held = plants.primary >= 0
-    standing_on = np.where(held, rows[frames, np.maximum(plants.primary, 0)], -1)
+    held, standing_on = plants.primary >= 0, rows_of(sole, plants.carrier)
     moved = horizontal_path(root, paths - root[:, None], standing_on, speed, sole.side, float(base.dt))
     details = {"offset_m": 0.0, "scale": 1.0}
     floor = plants.floor if target is None else target

@@ -63,7 +63,7 @@ def horizontal_path(
     own = np.diff(root, axis=0)
     correction = np.where(held[:, None], steps - own, 0.0)
     correction[:, 1] = 0.0
-    _carry_over_flights(correction, held, max(1, round(CARRY / dt)))
+    carry_over_flights(correction, held, dt)
     if not correction.any():
         return root.copy()
     moved = root.copy()
@@ -71,8 +71,9 @@ def horizontal_path(
     return moved
 
 
-def _carry_over_flights(correction: np.ndarray, held: np.ndarray, width: int) -> None:
-    """Fill the steps that are not held, in place."""
+def carry_over_flights(correction: Float[np.ndarray, "steps 3"], held: Bool[np.ndarray, " steps"], dt: float) -> None:
+    """Fill the steps that are not held, in place, from the medians of those `CARRY` before and after."""
+    width = max(1, round(CARRY / dt))
     for start, end in runs(~held):
         before, after = correction[max(start - width, 0) : start], correction[end + 1 : end + 1 + width]
         before, after = before[held[max(start - width, 0) : start]], after[held[end + 1 : end + 1 + width]]

@@ -2,7 +2,7 @@
 
 from motionfit.terms.balance import ZmpMargin
 from motionfit.terms.penetration import CapsuleClearance, JointClearance, SkinClearance
-from motionfit.terms.pose import Effort, JointTracking, RotationTracking, Smoothness
+from motionfit.terms.pose import Effort, JointTracking, RotationTracking, Smoothness, Steadiness
 
 __all__ = [
     "CapsuleClearance",
@@ -12,5 +12,6 @@ __all__ = [
     "RotationTracking",
     "SkinClearance",
     "Smoothness",
+    "Steadiness",
     "ZmpMargin",
 ]

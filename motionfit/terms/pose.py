@@ -47,6 +47,24 @@ class Smoothness(Term):
         return jnp.pad(bend, ((1, 2), (0, 0)))[: len(s)] / self.sigma
 
 
+class Steadiness(Term):
+    """First time derivative of some controls near zero: a stance as wide in one frame as in the next.
+
+    A leg that turns while its foot stands makes the foot slide. `sigma` [rad/s], per control (infinite: it may change
+    as it likes). The difference of the frames t and t + 1; the last row is zero.
+    """
+
+    sigma: Float[AnyArray, " controls"]
+
+    @property
+    def reach(self) -> int:
+        return 1
+
+    def residual(self, kin: Kinematics) -> Float[Array, "frames controls"]:
+        pace = (kin.signals[1:] - kin.signals[:-1]) / kin.dt
+        return jnp.pad(pace, ((0, 1), (0, 0))) / jnp.asarray(self.sigma)
+
+
 class JointTracking(Term):
     """World positions of some joints near a target: (p - target) / sigma, `target` and `sigma` in [m]."""
 

@@ -1,0 +1,68 @@
+"""How a motion stands: the `feet` and `balance` entries of report.json, for what a source clip shows as its plants."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from motionfit._character import Character
+from motionfit._motion import Motion, forward_kinematics
+from motionfit._types import InputError
+from motionfit.balance import ZmpDistance, balance_measures, sole_boxes, zmp_distance
+from motionfit.feet import Footplants, detect, find_sole, measure_feet
+from motionfit.shape.mass import mesh_masses
+
+
+class Stance(NamedTuple):
+    """When the source's feet are down: on the character (None without a sole), and on the body that says how balanced
+    it was, which is the reference where there is one; with its distances there, where there is one."""
+
+    plants: Footplants | None
+    original: Footplants | None
+    reference: ZmpDistance | None
+
+
+def source_stance(
+    character: Character, source: Motion, reference: Character | None = None, original: Motion | None = None
+) -> Stance:
+    """What a source clip, put on the character and (`original`) on a `reference`, says of standing."""
+    plants = _plants(character, source)
+    if reference is None or original is None:
+        return Stance(plants, plants, None)
+    own = _plants(reference, original)
+    return Stance(plants, own, _distance(reference, original, own, own))
+
+
+def measure_standing(character: Character, motion: Motion, stance: Stance) -> dict[str, dict | None]:
+    """The `feet` and `balance` entries of a motion on a character.
+
+    Feet are judged where the source has them down on the same character (`motionfit.feet.measure_feet`). The
+    zero-moment point is that of the segment masses of the cut mesh with their spin, its support the sole boxes of
+    the feet that the source has down, on the reference where there is one (`motionfit.balance`). None where a body
+    has no sole, or encloses no volume to weigh.
+    """
+    feet = None if stance.plants is None else measure_feet(character, motion, stance.plants)
+    distance = _distance(character, motion, stance.original, stance.plants)
+    return {"feet": feet, "balance": None if distance is None else balance_measures(distance, stance.reference)}
+
+
+def _plants(character: Character, motion: Motion) -> Footplants | None:
+    try:
+        return detect(find_sole(character), motion)[0]
+    except InputError:
+        return None
+
+
+def _distance(
+    character: Character, motion: Motion, down: Footplants | None, own: Footplants | None
+) -> ZmpDistance | None:
+    """Distances of the ZMP where the feet are `down`, on the floor of the character's `own` plants."""
+    if down is None or own is None:
+        return None
+    try:
+        if "weighed" not in character.memo:
+            character.memo["weighed"] = mesh_masses(character), sole_boxes(character)
+    except InputError:
+        return None
+    masses, soles = character.memo["weighed"]
+    kin = forward_kinematics(character.skeleton, motion)
+    return zmp_distance(kin, masses, soles, down.planted, ground=own.floor.at(np.asarray(motion.root, float)))
