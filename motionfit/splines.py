@@ -47,3 +47,10 @@ def bspline_basis(frame_count: int, dt: float, spacing: float) -> Basis:
     rows = BSpline.design_matrix(np.arange(frame_count, dtype=float), knots, DEGREE)
     first = rows.indices.reshape(frame_count, DEGREE + 1)
     return Basis(first[:, 0].astype(np.int32), rows.data.reshape(frame_count, DEGREE + 1), spans + DEGREE)
+
+
+def per_frame(frame_count: int) -> Basis:
+    """A value of its own for every frame: control point t is frame t's (the three behind the last count nowhere)."""
+    values = np.zeros((frame_count, DEGREE + 1))
+    values[:, 0] = 1.0
+    return Basis(np.arange(frame_count, dtype=np.int32), values, frame_count + DEGREE)

@@ -60,6 +60,35 @@ def leg_controls(character: Character, motion: Motion, basis: Basis) -> tuple[Co
             Control("thighs_apart", apart, basis, -np.pi / 4, np.pi / 4))  # fmt: skip
 
 
+def lean_controls(character: Character, motion: Motion, basis: Basis, gaze: bool = True) -> tuple[Control, ...]:
+    """Ankle against thigh, and the spine, each sideways and forward: thesis 4.7.3, bounds (4.13).
+
+    `lean_*` turns both thighs one way and both feet back, so that trunk and soles keep their orientation: seen from
+    the feet, the hips move. `spine_*` bends the trunk, shared evenly by the spine's joints; with `gaze` the head
+    turns back. Positive is to the left, and forward. Axes are level and follow the hips' heading.
+    """
+    skeleton = character.skeleton
+    positions, world = host_kinematics(motion)
+    left, right = (skeleton.joint(f"{s}_thigh") for s in SIDES)
+    across = _smooth((positions[:, left] - positions[:, right]) * np.array([1.0, 0.0, 1.0]), motion)
+    forward = np.cross(across, UP)
+    spine, controls = skeleton.chain("spine"), []
+
+    def drives(axis: np.ndarray, joints: tuple[int, ...], gain: float) -> tuple[Drive, ...]:
+        return tuple(Drive(j, _in_parent(skeleton, world, j, axis), gain) for j in joints)
+
+    legs = [tuple(skeleton.joint(f"{s}_{r}") for s in SIDES) for r in ("thigh", "foot")]
+    head = (skeleton.joint("head"),) if gaze and skeleton.find("head") is not None else ()
+    # about `forward` a positive turn takes what is up to the right, about `across` to the front
+    for name, axis, up in (("sideways", forward, -1.0), ("forward", across, 1.0)):
+        lean = drives(axis, legs[0], up) + drives(axis, legs[1], -up)
+        controls.append(Control(f"lean_{name}", lean, basis, -np.pi / 8, np.pi / 8))
+        if spine:
+            bend = drives(axis, spine, up / len(spine)) + drives(axis, head, -up)
+            controls.append(Control(f"spine_{name}", bend, basis, -np.pi / 8, np.pi / 8))
+    return tuple(controls)
+
+
 def _in_parent(skeleton: Skeleton, rotations_world: np.ndarray, joint: int, axis_world: np.ndarray) -> np.ndarray:
     """World axes, per frame, in the frame of a joint's parent."""
     parent = skeleton.parents[joint]

@@ -11,22 +11,21 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
 from motionfit._character import Character
 from motionfit._control import Control, Correction
 from motionfit._fit import Block, Fit, fit
-from motionfit._motion import Motion, bucket, host_kinematics
+from motionfit._motion import Motion, host_kinematics
 from motionfit._onto import onto
 from motionfit._problem import During, Problem, Term
 from motionfit._skeleton import SIDES
 from motionfit.adapt._clearance import Clearance, allowance, build_clearance, reduced, support, volume_depths
 from motionfit.adapt._controls import arm_controls, leg_controls
 from motionfit.adapt._limits import ENOUGH, SkinLooks, reference_depths
+from motionfit.adapt._sampling import SOLVE_RATE, sampling
 from motionfit.metrics import TOLERANCE, derivative_ratio
 from motionfit.shape.pairs import Pair, pairs_of
-from motionfit.splines import Basis, bspline_basis
+from motionfit.splines import Basis
 from motionfit.terms.pose import Effort, Smoothness
 
 LIMBS = ("arms", "legs")
 
-SOLVE_RATE = 60.0  # [1/s] of the frames that the solver sees: between two of them a limb's depth changes by millimetres
-KNOT_SPACING = 0.1  # [s]
 SOLVE_PROBES = {"upper_arm": 20, "forearm": 16, "hand": 12, "thigh": 20, "calf": 20}  # per pair, of those looked at
 ALLOWED_EXCESS = 0.004  # [m] that may stay where more was; well under TOLERANCE, which the skin is judged by
 MARGIN = 0.001  # [m]
@@ -159,26 +158,13 @@ def _controls(character: Character, base: Motion, blocks: Sequence[str]) -> tupl
 
     Knots lie on the same instants in both, so the control points are the same.
     """
-    step = max(1, round(base.frame_rate / SOLVE_RATE))
-    frames = np.arange(0, base.frame_count, step)
-    small = dataclasses.replace(base[frames], dt=np.asarray(base.dt, float) * step)
-    length = bucket(len(frames))
-    rows = frames[np.minimum(np.arange(length), len(frames) - 1)]
-    basis = bspline_basis(length, float(small.dt), KNOT_SPACING)
-    every = max(1, round(KNOT_SPACING / float(small.dt))) * step
-    whole = bspline_basis(base.frame_count, float(base.dt), every * float(base.dt))
+    at = sampling(base)
+    whole = at.whole
     controls = (*(arm_controls(character, base, whole) if "arms" in blocks else ()),
                 *(leg_controls(character, base, whole) if "legs" in blocks else ()))  # fmt: skip
 
-    def as_seen(control: Control) -> Control:
-        drives = tuple(
-            dataclasses.replace(d, axis_parent=d.axis_parent[rows]) if np.ndim(d.axis_parent) == 2 else d
-            for d in control.drives
-        )
-        return dataclasses.replace(control, drives=drives, basis=basis)
-
-    padded = dataclasses.replace(base[rows], dt=small.dt)
-    return controls, whole, Seen(frames, small, padded, basis, tuple(as_seen(c) for c in controls))
+    padded = dataclasses.replace(base[at.rows], dt=np.asarray(at.dt))
+    return controls, whole, Seen(at.frames, at.motion(base), padded, at.basis, tuple(at.control(c) for c in controls))
 
 
 def _final(controls: Sequence[Control], basis: Basis, correction: Correction) -> Correction:

@@ -1,6 +1,6 @@
 """Built-in terms: wishes about a motion, as residuals over Kinematics."""
 
-from motionfit.terms.balance import ZmpMargin
+from motionfit.terms.balance import Standing, ZmpMargin
 from motionfit.terms.penetration import CapsuleClearance, JointClearance, SkinClearance
 from motionfit.terms.pose import Effort, JointTracking, RotationTracking, Smoothness
 
@@ -12,5 +12,6 @@ __all__ = [
     "RotationTracking",
     "SkinClearance",
     "Smoothness",
+    "Standing",
     "ZmpMargin",
 ]
