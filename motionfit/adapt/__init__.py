@@ -3,12 +3,13 @@
 import sys
 import types
 
+from motionfit.adapt._balance import balance
 from motionfit.adapt._clearance import OBJECTIVES, build_clearance, volume_depths
 from motionfit.adapt._limbs import limbs
 from motionfit.adapt._limits import reference_depths
 from motionfit.adapt._procedure import BLOCKS, adapt, arms, legs
 
-__all__ = ["BLOCKS", "OBJECTIVES", "adapt", "arms", "build_clearance", "legs", "limbs", "reference_depths", "volume_depths"]
+__all__ = ["BLOCKS", "OBJECTIVES", "adapt", "arms", "balance", "build_clearance", "legs", "limbs", "reference_depths", "volume_depths"]
 
 
 class _CallableModule(types.ModuleType):

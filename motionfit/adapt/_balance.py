@@ -11,8 +11,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from motionfit._character import Character
 from motionfit._control import Control, Correction
-from motionfit._fit import Block, BlockReport, Fit, fit
-from motionfit._motion import Motion, bind_pose, continued, forward_kinematics, host_kinematics
+from motionfit._fit import Block, Fit, fit
+from motionfit._motion import Motion, continued, forward_kinematics, host_kinematics
 from motionfit._onto import onto
 from motionfit._problem import During, Problem
 from motionfit._skeleton import SIDES
@@ -33,6 +33,7 @@ from motionfit.terms.pose import Effort, Smoothness
 
 ALLOWED_EXCESS = 0.005  # [m] beyond its threshold that a frame may keep: what the filter's choice alone makes
 MEAN_ENOUGH = 0.0005  # [m] of mean distance more than the source's, what may be left
+MOST_LEFT = 0.001  # [m] the same, before it counts as a violation
 CARTOON = 0.9  # thesis 4.7.3: thresholds scaled by less lean the character more than one would
 EFFORT = 0.3  # [rad]
 JERK_SHARE = 0.5  # of the source's own jerk, what the hips may get at the cost of 1 per frame
@@ -98,10 +99,10 @@ def balance(
                      ground=stance.ground[at.rows], frames_around=round(5 * WINDOW / at.dt) + 1)  # fmt: skip
     seen = continued(at.motion(motion), len(at.rows))
     home = host_kinematics(seen)[0][:, list(feet)]
-    known = _depths(clip, character, reference, motion, at)
+    sinks = _sinking(clip, character, reference, motion, at)
     limit, points = scale * threshold + ALLOWED_EXCESS, Correction.zero(tuple(at.control(c) for c in controls))
     smooth = JERK_SHARE * max(_jerk(motion), LEAST_JERK) / LEVER
-    effort, history, best = EFFORT, [], None
+    effort, history = EFFORT, []
     real = np.arange(len(at.rows)) < len(at.frames)
     for _ in range(ROUNDS):
         zmp = eqx.tree_at(lambda z: z.threshold, term, _padded(limit, at, 0.0))
@@ -115,9 +116,7 @@ def balance(
         result = _stood(so_far, controls, at, points, feet, share)
         after = _distance(character, result.motion, stance, planted, at)
         jerk = derivative_ratio(result.motion, motion, 3) or 1.0
-        sunk = known is not None and (known(result.motion) > TOLERANCE).any()
-        print(f"  mean {_mean(own)*1e3:.2f} {_mean(before)*1e3:.2f} -> {_mean(after)*1e3:.2f} mm jerk {jerk:.3f} sunk {sunk} steps {solved.history[-1].accepted_steps} {solved.history[-1].status} {solved.history[-1].time_s:.1f}s", {c.name: round(float(np.abs(c.signal(p)).max()),3) for c,p in zip(points.controls, points.points)})
-        best = (result, after)
+        sunk = sinks(result.motion)
         if _mean(after) <= wanted + MEAN_ENOUGH and jerk <= MOST_JERK and not sunk:
             break
         if jerk > MOST_JERK:
@@ -127,9 +126,15 @@ def balance(
         if _mean(after) > wanted + MEAN_ENOUGH:
             left = np.where(after.supported, np.asarray(after.outside) - scale * threshold, 0.0)
             limit = limit - np.maximum(left, 0.0)
-    assert best is not None
-    result, after = best
-    return done(dataclasses.replace(result, history=(*so_far.history, *history)), after)
+    for part in (0.5, 0.25, 0.0) if sunk else ():
+        # rather less balanced than a part in another
+        result = _stood(so_far, controls, at, points, feet, share, part)
+        after, sunk = _distance(character, result.motion, stance, planted, at), sinks(result.motion)
+        if not sunk:
+            break
+    reached = _mean(after) <= wanted + MOST_LEFT
+    return done(dataclasses.replace(result, history=(*so_far.history, *history),
+                                    status=so_far.status if reached else "violations_left"), after)  # fmt: skip
 
 
 def _padded(rows: np.ndarray, at: Sampling, value) -> np.ndarray:
@@ -172,30 +177,33 @@ def _share(planted: Bool[np.ndarray, "frames 2"], dt: float) -> Float[np.ndarray
 
 def _jerk(motion: Motion) -> float:
     """Mean jerk [m/s^3] of the joints, noise left out."""
+    if motion.frame_count < 4:
+        return 0.0
     positions = gaussian_filter1d(host_kinematics(motion)[0], 0.016 / float(motion.dt), axis=0, mode="nearest")
     return float(np.linalg.norm(np.diff(positions, 3, axis=0), axis=-1).mean()) / float(motion.dt) ** 3
 
 
-def _depths(clip, character, reference, motion, at):
-    """How much deeper [m] than before the block the pairs are that the block has to answer for; None without pairs."""
+def _sinking(clip: Motion, character: Character, reference: Character | None, so_far: Motion, at: Sampling):
+    """Says of a motion whether some pair shows more than the tolerance, and more than before the block."""
     clearance = build_clearance(character, PAIRS)
     limit, _ = reference_depths(clip[at.frames], character, reference, PAIRS)
-    before = volume_depths(clearance, at.motion(motion)) - limit
+    before = volume_depths(clearance, at.motion(so_far)) - limit
 
-    def excess(after: Motion) -> Float[np.ndarray, "frames pairs"]:
-        now = volume_depths(clearance, at.motion(after)) - limit
-        return np.where(now > before + 0.001, now, 0.0)
+    def sinks(motion: Motion) -> bool:
+        now = volume_depths(clearance, at.motion(motion)) - limit
+        return bool((now > np.maximum(before + 0.001, TOLERANCE)).any())
 
-    return excess
+    return sinks
 
 
 def _stood(
     so_far: Fit, controls: tuple[Control, ...], at: Sampling, points: Correction, feet: tuple[int, ...],
-    share: Float[np.ndarray, "frames 2"],
+    share: Float[np.ndarray, "frames 2"], part: float = 1.0,
 ) -> Fit:  # fmt: skip
-    """The block's controls on top of the fit so far, with every foot where it was: the root moves, the legs follow."""
+    """The block's controls, or a part of them, on top of the fit so far, with every foot where it was: the root moves,
+    the legs follow."""
     motion, skeleton = so_far.motion, so_far.motion.skeleton
-    mine = Correction(controls, tuple(np.asarray(p)[: at.whole.count] for p in points.points))
+    mine = Correction(controls, tuple(part * np.asarray(p)[: at.whole.count] for p in points.points))
     leaned = mine.apply(motion)
     home, turned = host_kinematics(motion)[0][:, list(feet)], host_kinematics(leaned)[0][:, list(feet)]
     shift = (share[..., None] * (home - turned)).sum(axis=1)

@@ -9,12 +9,13 @@ from motionfit._motion import Motion
 from motionfit._onto import onto
 from motionfit._problem import Problem
 from motionfit._types import InputError
+from motionfit.adapt._balance import balance
 from motionfit.adapt._limbs import LIMBS, limbs
 from motionfit.shape.growth import grow
 
 Progress = Callable[[str, int, int], None]
 
-BLOCKS = (*LIMBS,)
+BLOCKS = (*LIMBS, "balance")
 
 
 def adapt(
@@ -32,8 +33,9 @@ def adapt(
 
     The clip is put on the character (`motionfit.onto`), then the blocks run in the order of thesis 5.2: `arms` keeps
     upper arms, forearms and hands out of the trunk and the thighs, the left arm first, `legs` the thighs and calves
-    apart. Penetration counts as far as it exceeds what the same clip shows on `reference`, the body that it was made
-    for; without one, on the character before `girth`, else in its rest pose.
+    apart; `balance` keeps the zero-moment point as near to the support as it was. Penetration counts as far as it
+    exceeds what the same clip shows on `reference`, the body that it was made for; without one, on the character
+    before `girth`, else in its rest pose.
 
     The `Fit` holds the adapted motion, the correction, what each block did, and in `details` what the blocks
     measured: see `motionfit.adapt.limbs`.
@@ -50,6 +52,8 @@ def adapt(
                     progress=progress)  # fmt: skip
     else:
         fit = Fit(Correction((), ()), base, base, "converged", (), Problem(character, base, {}, ()))
+    if "balance" in blocks:
+        fit = balance(clip, character, fit, reference=reference)
     return fit
 
 
