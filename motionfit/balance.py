@@ -155,7 +155,7 @@ def zero_moment_point(
     masses: Masses,
     *,
     spin: bool = True,
-    ground: float | Float[AnyArray, ""] = 0.0,
+    ground: float | Float[AnyArray, "*frames"] = 0.0,
     window: float | Float[AnyArray, ""] = WINDOW,
 ) -> Zmp:
     """The zero-moment point: thesis 4.7, after Takanishi & Kato.
@@ -164,7 +164,7 @@ def zero_moment_point(
     about c: x = c_x + (dk_z/dt / M - c_y c_x'') / (c_y'' + g), z = c_z - (dk_x/dt / M + c_y c_z'') / (c_y'' + g). The
     two are equal; this form needs the filter for six signals instead of three per body, and a clip far from the origin
     loses no digits. `spin` adds the segments' own angular momentum, which the thesis leaves out. y is measured from
-    `ground` [m].
+    `ground` [m], one height or one per frame.
 
     In flight the denominator vanishes: it is held above `FLIGHT` g, so that nothing is infinite; `load` tells those
     frames, and every measure here leaves them out.
@@ -342,7 +342,7 @@ def zmp_distance(
     planted: Bool[AnyArray, "frames feet"],
     *,
     spin: bool = True,
-    ground: float | Float[AnyArray, ""] = 0.0,
+    ground: float | Float[AnyArray, "*frames"] = 0.0,
     window: float | Float[AnyArray, ""] = WINDOW,
 ) -> ZmpDistance:
     """How far the ZMP is from the support in every frame.

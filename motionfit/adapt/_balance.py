@@ -7,7 +7,7 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
 
 from motionfit._character import Character
 from motionfit._control import Control, Correction
@@ -23,7 +23,7 @@ from motionfit.adapt._limits import reference_depths
 from motionfit.adapt._record import recorded
 from motionfit.adapt._sampling import Sampling, sampling
 from motionfit.balance import WINDOW, Soles, ZmpDistance, sole_boxes, zmp_distance
-from motionfit.feet._leg import find_legs, turn_legs
+from motionfit.feet._leg import Leg, find_legs, turn_legs
 from motionfit.feet._remove import detect_footplants
 from motionfit.metrics import TOLERANCE, derivative_ratio
 from motionfit.shape.mass import Masses, mesh_masses
@@ -41,6 +41,7 @@ LEAST_JERK = 10.0  # [m/s^3] for clips that stand still
 LEVER = 0.9  # [m] ankle to hip
 MOST_JERK = 1.04  # ratio to that of the motion before the block
 PASS_OVER = 0.08  # [s] within which the weight goes from one foot to the other
+STRETCH = 0.998  # of a leg's length, as far as it may be stretched: straight legs leave no way to shift the hips
 ROUNDS = 5
 
 
@@ -209,6 +210,8 @@ def _stood(
     shift = (share[..., None] * (home - turned)).sum(axis=1)
     positions, rotations = host_kinematics(leaned)
     legs = find_legs(skeleton, positions + shift[:, None], rotations)
+    shift = shift - _down(legs, find_legs(skeleton, *host_kinematics(motion)), float(motion.dt))
+    legs = find_legs(skeleton, positions + shift[:, None], rotations)
     local, _ = turn_legs(leaned, legs, [home[:, k] for k in range(2)], rotations)
     root = np.asarray(motion.root, float) + shift
     result = Motion(skeleton, root, local, motion.dt, motion.translations)
@@ -217,3 +220,15 @@ def _stood(
     joints = sorted({int(d.joint) for c in controls for d in c.drives} | {j for leg in legs for j in leg.joints})
     whole = recorded("stand", result, base, both, joints)
     return dataclasses.replace(so_far, correction=whole, motion=whole.apply(base), base=base)
+
+
+def _down(legs: list[Leg], before: list[Leg], dt: float) -> Float[np.ndarray, "frames 3"]:
+    """How far [m] the body comes down so that no leg must be longer than it is, nor straighter than it was."""
+    needed = np.zeros(len(legs[0].hip))
+    for leg, old in zip(legs, before, strict=True):
+        reach = np.maximum(STRETCH * leg.length, np.linalg.norm(old.hip - old.ankle, axis=1))
+        needed = np.maximum(needed, np.linalg.norm(leg.hip - old.ankle, axis=1) - reach)
+    width = 2 * max(1, round(PASS_OVER / dt)) + 1
+    # the mean of a maximum over the same width never falls below the demand
+    down = uniform_filter1d(maximum_filter1d(np.maximum(needed, 0.0), width, mode="nearest"), width, mode="nearest")
+    return down[:, None] * np.array([0.0, 1.0, 0.0])

@@ -1,7 +1,7 @@
 """Built-in terms: wishes about a motion, as residuals over Kinematics."""
 
 from motionfit.terms.balance import Standing, ZmpMargin
-from motionfit.terms.penetration import CapsuleClearance, JointClearance, SkinClearance
+from motionfit.terms.penetration import CapsuleClearance, JointClearance, SkinClearance, SkinContact
 from motionfit.terms.pose import Effort, JointTracking, RotationTracking, Smoothness
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "JointTracking",
     "RotationTracking",
     "SkinClearance",
+    "SkinContact",
     "Smoothness",
     "Standing",
     "ZmpMargin",

@@ -40,7 +40,7 @@ class ZmpMargin(Term):
     scale: Float[AnyArray, ""] = eqx.field(converter=_array, default=1.0)
     sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.01)
     width: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.002)
-    ground: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.0)
+    ground: Float[AnyArray, "*frames"] = eqx.field(converter=_array, default=0.0)
     window: Float[AnyArray, ""] = eqx.field(converter=_array, default=WINDOW)
     spin: bool = eqx.field(static=True, default=True)
     frames_around: int | None = eqx.field(static=True, default=None)
