@@ -48,7 +48,7 @@ def adapt(
         str | None, typer.Option(help="PART=SCALE,… e.g. arms=1.3,trunk=1.5; one number grows all")
     ] = None,
     reference: Annotated[str | None, typer.Option(help="the body that the clip was made for")] = None,
-    blocks: Annotated[str, typer.Option(help="arms,legs in the order to run, or none")] = "arms,legs",
+    blocks: Annotated[str, typer.Option(help="some of arms,legs,forearm,collisions,balance, or none")] = "arms,legs,balance",
     objective: Annotated[str, typer.Option(help="vertex, capsule or joint")] = "vertex",
     fps: Annotated[float | None, typer.Option(help="resample the clip to this frame rate [1/s]")] = None,
     start: Annotated[float | None, typer.Option(help="cut the clip from here [s]")] = None,
@@ -161,7 +161,7 @@ def footskate(
 
 def run_adapt(
     clip: str, character: str, *, out: pathlib.Path, girth: str | None = None, reference: str | None = None,
-    blocks: str = "arms,legs", objective: str = "vertex", fps: float | None = None, start: float | None = None,
+    blocks: str = "arms,legs,balance", objective: str = "vertex", fps: float | None = None, start: float | None = None,
     end: float | None = None, unit: float | None = None, up: str | None = None, roles: pathlib.Path | None = None,
     report: pathlib.Path | None = None, plot: pathlib.Path | None = None,
 ) -> None:  # fmt: skip
@@ -231,10 +231,11 @@ def run_adapt(
 
 
 def _times(history) -> dict[str, float]:
-    """Seconds per entry of --blocks: both arms are one of them."""
+    """Seconds per entry of --blocks: both arms are one of them, and both forearms."""
     seconds: dict[str, float] = {}
     for report in history:
-        name = "arms" if report.name.endswith("_arm") else report.name
+        name = report.name.partition("_")[2]
+        name = {"arm": "arms", "forearm": "forearm"}.get(name, report.name)
         seconds[name] = seconds.get(name, 0.0) + report.time_s
     return seconds
 

@@ -5,11 +5,17 @@ import types
 
 from motionfit.adapt._balance import balance
 from motionfit.adapt._clearance import OBJECTIVES, build_clearance, volume_depths
+from motionfit.adapt._collisions import GROUPS, Group, Sphere, collisions
+from motionfit.adapt._controls import Turn
+from motionfit.adapt._forearm import forearm, multi_start
 from motionfit.adapt._limbs import limbs
 from motionfit.adapt._limits import reference_depths
-from motionfit.adapt._procedure import BLOCKS, adapt, arms, legs
+from motionfit.adapt._procedure import BLOCKS, DEFAULT, adapt, arms, legs
 
-__all__ = ["BLOCKS", "OBJECTIVES", "adapt", "arms", "balance", "build_clearance", "legs", "limbs", "reference_depths", "volume_depths"]
+__all__ = [
+    "BLOCKS", "DEFAULT", "GROUPS", "Group", "OBJECTIVES", "Sphere", "Turn", "adapt", "arms", "balance",
+    "build_clearance", "collisions", "forearm", "legs", "limbs", "multi_start", "reference_depths", "volume_depths",
+]  # fmt: skip
 
 
 class _CallableModule(types.ModuleType):

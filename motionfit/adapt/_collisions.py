@@ -105,7 +105,7 @@ GROUPS: tuple[Group, ...] = (*_hands("left", "right"), *_hands("right", "left"),
 """The five tables of the thesis, per side: legs/torso, hands/torso, hands/head, hands/shoulders, hands/legs."""
 
 
-class _Known(NamedTuple):
+class Known(NamedTuple):
     """The clearance of some groups on a body, and the radius [m] of each row."""
 
     clearance: Clearance
@@ -143,7 +143,7 @@ def _together(groups: Sequence[Group]) -> list[list[Group]]:
     return list(found.values())
 
 
-def _known(character: Character, groups: Sequence[Group]) -> _Known:
+def known_depths(character: Character, groups: Sequence[Group]) -> Known:
     pairs, probes, fields, field_of, parts, radius = [], [], [], [], [], []
     for group in groups:
         for part in (p for p in (*group.avoid, *(q for q in group.probes if isinstance(q, str))) if p not in PARTS):
@@ -162,7 +162,7 @@ def _known(character: Character, groups: Sequence[Group]) -> _Known:
                               else _at_sphere(character, probe))  # fmt: skip
     term = SkinClearance(tuple(probes), tuple(_of(character, fit_field, *key) for key in fields), tuple(field_of),
                          (np.zeros((1, 1)),) * len(probes))  # fmt: skip
-    return _Known(Clearance(term, tuple(pairs), tuple(range(len(pairs))), tuple(parts)), np.array(radius))
+    return Known(Clearance(term, tuple(pairs), tuple(range(len(pairs))), tuple(parts)), np.array(radius))
 
 
 def _at_sphere(character: Character, sphere: Sphere) -> Probes:
@@ -173,13 +173,13 @@ def _at_sphere(character: Character, sphere: Sphere) -> Probes:
 def _solve(
     clip: Motion, character: Character, so_far: Fit, reference: Character | None, groups: list[Group]
 ) -> tuple[Fit, dict]:
-    motion, known = so_far.motion, _known(character, groups)
+    motion, known = so_far.motion, known_depths(character, groups)
     at = sampling(motion, groups[0].spacing / 60.0)
     small, count = at.motion(motion), len(at.frames)
     if reference is None:
         own = known.depths(at.motion(so_far.base))
     else:
-        own = _known(reference, groups).depths(at.motion(onto(clip, reference.skeleton)))
+        own = known_depths(reference, groups).depths(at.motion(onto(clip, reference.skeleton)))
     before = known.depths(small)
     pairs = known.clearance.pairs
     inner = np.array([p.adjacent for p in pairs])

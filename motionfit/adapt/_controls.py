@@ -97,7 +97,7 @@ class Turn(NamedTuple):
     """A control as data: each drive names a role, an axis and a gain, and `bound` [rad] holds both ways.
 
     Axes are directions of the trunk, "left", "up" and "forward", or of the limb itself: "bend", about which it bends
-    over the clip (positive: more), and "swing", across that and the bone. A bend never stretches a limb beyond straight.
+    over the clip (positive: more), "swing", across that and the bone, and "twist", about the bone itself. A bend never stretches a limb beyond straight.
     """
 
     name: str
@@ -121,10 +121,12 @@ def turn_controls(motion: Motion, basis: Basis, turns: Sequence[Turn]) -> tuple[
             if name in ("bend", "swing"):
                 axis, least = _limb_axis(motion, positions, world, joint, name)
                 lower = max(lower, -least) if name == "bend" else lower
+            elif name == "twist":
+                axis = _smooth(positions[:, skeleton.children(joint)[0]] - positions[:, joint], motion)
             elif name in trunk:
                 axis = trunk[name]
             else:
-                raise InputError(f"unknown axis {name!r} of {turn.name}; axes: {', '.join(trunk)}, bend, swing")
+                raise InputError(f"unknown axis {name!r} of {turn.name}; axes: {', '.join(trunk)}, bend, swing, twist")
             drives.append(Drive(joint, _in_parent(skeleton, world, joint, axis), gain))
         controls.append(Control(turn.name, tuple(drives), basis, lower, turn.bound))
     return tuple(controls)

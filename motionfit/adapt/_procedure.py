@@ -10,12 +10,16 @@ from motionfit._onto import onto
 from motionfit._problem import Problem
 from motionfit._types import InputError
 from motionfit.adapt._balance import balance
+from motionfit.adapt._collisions import collisions
+from motionfit.adapt._forearm import forearm
 from motionfit.adapt._limbs import LIMBS, limbs
 from motionfit.shape.growth import grow
 
 Progress = Callable[[str, int, int], None]
 
-BLOCKS = (*LIMBS, "balance")
+LATER = {"forearm": forearm, "collisions": collisions, "balance": balance}
+BLOCKS = (*LIMBS, *LATER)
+DEFAULT = ("arms", "legs", "balance")  # the others cost more than they change on most clips
 
 
 def adapt(
@@ -24,7 +28,7 @@ def adapt(
     *,
     reference: Character | None = None,
     girth: Mapping[str, float] | None = None,
-    blocks: Sequence[str] = BLOCKS,
+    blocks: Sequence[str] = DEFAULT,
     objective: str = "vertex",
     sweeps: int = 1,
     progress: Progress | None = None,
@@ -33,9 +37,11 @@ def adapt(
 
     The clip is put on the character (`motionfit.onto`), then the blocks run in the order of thesis 5.2: `arms` keeps
     upper arms, forearms and hands out of the trunk and the thighs, the left arm first, `legs` the thighs and calves
-    apart; `balance` keeps the zero-moment point as near to the support as it was. Penetration counts as far as it
-    exceeds what the same clip shows on `reference`, the body that it was made for; without one, on the character
-    before `girth`, else in its rest pose.
+    apart; `forearm` brings the forearms back to where they pointed; `collisions` takes hands out of head, other arm
+    and legs, and keeps touches that were meant; `balance` keeps the zero-moment point as near to the support as it
+    was. Each has options of its own as `motionfit.adapt.forearm` and so on, which go on from a `Fit`. Penetration
+    counts as far as it exceeds what the same clip shows on `reference`, the body that it was made for; without one,
+    on the character before `girth`, else in its rest pose.
 
     The `Fit` holds the adapted motion, the correction, what each block did, and in `details` what the blocks
     measured: see `motionfit.adapt.limbs`.
@@ -52,8 +58,9 @@ def adapt(
                     progress=progress)  # fmt: skip
     else:
         fit = Fit(Correction((), ()), base, base, "converged", (), Problem(character, base, {}, ()))
-    if "balance" in blocks:
-        fit = balance(clip, character, fit, reference=reference)
+    for name, block in LATER.items():
+        if name in blocks:
+            fit = block(clip, character, fit, reference=reference)
     return fit
 
 

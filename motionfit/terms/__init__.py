@@ -2,10 +2,11 @@
 
 from motionfit.terms.balance import Standing, ZmpMargin
 from motionfit.terms.penetration import CapsuleClearance, JointClearance, SkinClearance, SkinContact
-from motionfit.terms.pose import Effort, JointTracking, RotationTracking, Smoothness
+from motionfit.terms.pose import Direction, Effort, JointTracking, RotationTracking, Smoothness
 
 __all__ = [
     "CapsuleClearance",
+    "Direction",
     "Effort",
     "JointClearance",
     "JointTracking",
