@@ -26,9 +26,7 @@ CLIPS = ("bvh/02_01_walk", "bvh/05_01_slow_walk", "bvh/16_21_fast_walk", "bvh/16
 BODIES = ("heavy_male", "tall_male", "athletic_female", "short_female", "avg_male*1.3", "avg_male*1.6")
 
 
-def constant_offset(
-    fit: mf.Fit, character: mf.Character, own: np.ndarray, at: np.ndarray, aim: np.ndarray
-) -> Motion:
+def constant_offset(fit: mf.Fit, character: mf.Character, own: np.ndarray, at: np.ndarray, aim: np.ndarray) -> Motion:
     """The smallest constant turn per driven joint that leaves no more excess on volumes and skin than the fit does.
 
     What an artist does with an arm-space slider: one rotation vector per shoulder and one opposite angle for the

@@ -48,7 +48,9 @@ def adapt(
         str | None, typer.Option(help="PART=SCALE,… e.g. arms=1.3,trunk=1.5; one number grows all")
     ] = None,
     reference: Annotated[str | None, typer.Option(help="the body that the clip was made for")] = None,
-    blocks: Annotated[str, typer.Option(help="some of arms,legs,forearm,collisions,balance, or none")] = "arms,legs,balance",
+    blocks: Annotated[
+        str, typer.Option(help="some of arms,legs,forearm,collisions,balance, or none")
+    ] = "arms,legs,balance",
     objective: Annotated[str, typer.Option(help="vertex, capsule or joint")] = "vertex",
     fps: Annotated[float | None, typer.Option(help="resample the clip to this frame rate [1/s]")] = None,
     start: Annotated[float | None, typer.Option(help="cut the clip from here [s]")] = None,

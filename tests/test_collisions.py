@@ -43,7 +43,10 @@ def sunk(average):
 @pytest.mark.slow
 def test_a_hand_comes_out_of_the_thigh(sunk, average):
     base, bad = sunk
-    turns = (Turn("arm_out", (("left_upper_arm", "forward", 1.0),)), Turn("arm_ahead", (("left_upper_arm", "left", 1.0),)))
+    turns = (
+        Turn("arm_out", (("left_upper_arm", "forward", 1.0),)),
+        Turn("arm_ahead", (("left_upper_arm", "left", 1.0),)),
+    )
     group = Group("hand/thigh", ("left_hand",), ("left_thigh",), turns)
     fit = mf.adapt.collisions(base, average, _as_fit(bad, base, average), groups=(group,))
     told = fit.details["collisions"]["left_hand/left_thigh"]
@@ -106,7 +109,9 @@ def test_direction_is_the_thesis_s_objective_and_has_its_gradient():
 
     @jax.jit
     def cost(x):
-        return 0.5 * jnp.sum(term.residual(mf.forward_kinematics(motion.skeleton, _turned(motion, 0, [0.6, 0, 0.8], x[0]))) ** 2)
+        return 0.5 * jnp.sum(
+            term.residual(mf.forward_kinematics(motion.skeleton, _turned(motion, 0, [0.6, 0, 0.8], x[0]))) ** 2
+        )
 
     x = np.array([0.3])
     np.testing.assert_allclose(jax.grad(cost)(x), central_difference(cost, x), rtol=RELATIVE, atol=1e-8)
@@ -125,7 +130,9 @@ def test_contact_asks_only_for_what_was_lost(average):
 
     @jax.jit
     def cost(x):
-        return 0.5 * jnp.sum(term.residual(mf.forward_kinematics(motion.skeleton, _turned(motion, joint, [0.6, 0, 0.8], x[0]))) ** 2)
+        return 0.5 * jnp.sum(
+            term.residual(mf.forward_kinematics(motion.skeleton, _turned(motion, joint, [0.6, 0, 0.8], x[0]))) ** 2
+        )
 
     x = np.array([0.01])
     np.testing.assert_allclose(jax.grad(cost)(x), central_difference(cost, x), rtol=1e-4, atol=1e-6)

@@ -44,12 +44,17 @@ def main() -> None:
                                                           (corrected, balanced))]  # fmt: skip
             feet = [[character.skeleton.joint(f"{s}_{r}") for r in ("foot", "toe")] for s in ("left", "right")]
             places = [host_kinematics(f.motion)[0] for f in (corrected, balanced)]
-            moved = max(float(np.abs((places[1] - places[0])[planted[:, k]][:, feet[k]]).max(initial=0.0)) for k in (0, 1))
+            moved = max(
+                float(np.abs((places[1] - places[0])[planted[:, k]][:, feet[k]]).max(initial=0.0)) for k in (0, 1)
+            )
             step = max(1, clip.frame_count // SKIN_LOOKS)
             skin = skin_depths(reference, own, step=step).depth
             over = [float((skin_depths(character, f.motion, step=step).depth - skin > 0.01).any(1).mean())
                     for f in (corrected, balanced)]  # fmt: skip
-            cells = [f"{100 * (m['zmp_distance_mean_m'] or 0):.2f} ({100 * (m['zmp_distance_sd_m'] or 0):.2f})" for m in found]
+            cells = [
+                f"{100 * (m['zmp_distance_mean_m'] or 0):.2f} ({100 * (m['zmp_distance_sd_m'] or 0):.2f})"
+                for m in found
+            ]
             jerk = derivative_ratio(balanced.motion, corrected.motion, 3)
             rows.append([name, body, *cells, f"{1e3 * moved:.3f}", f"{jerk:.3f}", *(f"{100 * o:.0f}" for o in over),
                          balanced.status])  # fmt: skip

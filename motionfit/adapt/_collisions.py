@@ -264,7 +264,10 @@ def _filled(rows: np.ndarray, at: Sampling, value: float) -> np.ndarray:
 def _told(pairs, before, after, limit, touching, inner) -> dict:
     told = {}
     for k, pair in enumerate(pairs):
-        row = {"excess_before_m": float((before - limit)[:, k].max()), "excess_after_m": float((after - limit)[:, k].max())}
+        row = {
+            "excess_before_m": float((before - limit)[:, k].max()),
+            "excess_after_m": float((after - limit)[:, k].max()),
+        }
         if touching[:, k].any():
             row["touching_before"] = float((before > -TOUCH)[touching[:, k], k].mean())
             row["touching_after"] = float((after > -TOUCH)[touching[:, k], k].mean())
