@@ -3,6 +3,7 @@
 Bad input ends with one line on stderr and status 2; a violation that is left over the tolerance with status 3.
 """
 
+import contextlib
 import json
 import math
 import os
@@ -273,7 +274,7 @@ class _CompileClock:
 def _measure_all(body, motions: dict, source, clip, reference, progress) -> dict[str, dict]:
     """An M of report.json per motion; `_excess` holds the excess depths on the volumes for the picture."""
     import motionfit as mf
-    from motionfit.adapt import build_clearance, reference_depths, volume_depths
+    from motionfit.adapt import build_clearance, measure_balance, reference_depths, volume_depths
     from motionfit.metrics import measure, skin_depths
 
     pairs = mf.shape.PAIRS
@@ -296,6 +297,9 @@ def _measure_all(body, motions: dict, source, clip, reference, progress) -> dict
         else:
             skin = skin_depths(body, motion, step=step, progress=progress.task(f"skin {name}"))
             result[name] = measure(motion, source, volume_excess=excess, skin=skin, reference=own)
+            if motion.frame_count == clip.frame_count:
+                with contextlib.suppress(mf.InputError):  # a body without soles has no balance to measure
+                    result[name]["balance"] = measure_balance(clip, body, motion, reference)
         result[name]["_excess"] = excess
     return result
 

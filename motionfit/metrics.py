@@ -182,7 +182,8 @@ def measure(
     """One M of report.json (schema 1): penetration on volumes and skin, fidelity and smoothness against `source`.
 
     `volume_excess` [m] per frame and pair comes from `motionfit.adapt.volume_depths`, `skin` and `reference` from
-    `skin_depths`. Feet and balance are null: they are measured by the parts of motionfit that treat them.
+    `skin_depths`. Feet and balance are null: `motionfit.feet.measure_feet` and `motionfit.adapt.measure_balance` measure
+    them.
     """
     penetration: dict = {"excess_max_m": None, "excess_mean_m": None, "frames_over_1cm": None, "pairs": {}}
     if volume_excess is not None:

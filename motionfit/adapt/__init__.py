@@ -3,7 +3,7 @@
 import sys
 import types
 
-from motionfit.adapt._balance import balance
+from motionfit.adapt._balance import balance, measure_balance
 from motionfit.adapt._clearance import OBJECTIVES, build_clearance, volume_depths
 from motionfit.adapt._collisions import GROUPS, Group, Sphere, collisions
 from motionfit.adapt._controls import Turn
@@ -14,7 +14,7 @@ from motionfit.adapt._procedure import BLOCKS, DEFAULT, adapt, arms, legs
 
 __all__ = [
     "BLOCKS", "DEFAULT", "GROUPS", "Group", "OBJECTIVES", "Sphere", "Turn", "adapt", "arms", "balance",
-    "build_clearance", "collisions", "forearm", "legs", "limbs", "multi_start", "reference_depths", "volume_depths",
+    "build_clearance", "collisions", "forearm", "legs", "limbs", "measure_balance", "multi_start", "reference_depths", "volume_depths",
 ]  # fmt: skip
 
 

@@ -22,11 +22,11 @@ from motionfit.adapt._controls import lean_controls
 from motionfit.adapt._limits import reference_depths
 from motionfit.adapt._record import recorded
 from motionfit.adapt._sampling import Sampling, sampling
-from motionfit.balance import WINDOW, Soles, ZmpDistance, sole_boxes, zmp_distance
+from motionfit.balance import WINDOW, Soles, ZmpDistance, balance_measures, sole_boxes, zmp_distance
 from motionfit.feet._leg import Leg, find_legs, turn_legs
 from motionfit.feet._remove import detect_footplants
 from motionfit.metrics import TOLERANCE, derivative_ratio
-from motionfit.shape.mass import Masses, mesh_masses
+from motionfit.shape.mass import Masses, mass_volumes, mesh_masses, volume_masses
 from motionfit.shape.pairs import PAIRS
 from motionfit.terms.balance import Standing, ZmpMargin
 from motionfit.terms.pose import Effort, Smoothness
@@ -138,6 +138,19 @@ def balance(
                                     status=so_far.status if reached else "violations_left"), after)  # fmt: skip
 
 
+def measure_balance(clip: Motion, character: Character, motion: Motion, reference: Character | None = None) -> dict:
+    """report.json's `balance` entry of a motion on the character, for the footplants of the clip on `reference`.
+
+    At the rate that the solver sees; without a reference, the clip on the character itself is what it is compared with.
+    """
+    body = reference or character
+    source = onto(clip, body.skeleton)
+    plants, at = detect_footplants(source, body), sampling(source)
+    own = _distance(body, source, _stance(body, source, plants.floor), plants.planted, at)
+    stance = _stance(character, motion, detect_footplants(motion, character).floor)
+    return balance_measures(_distance(character, motion, stance, plants.planted, at), own)
+
+
 def _padded(rows: np.ndarray, at: Sampling, value) -> np.ndarray:
     """Rows of the frames that are seen, and a value for those that fill the bucket."""
     more = np.full((len(at.rows) - len(rows), *rows.shape[1:]), value, rows.dtype)
@@ -146,7 +159,11 @@ def _padded(rows: np.ndarray, at: Sampling, value) -> np.ndarray:
 
 def _stance(body: Character, motion: Motion, floor) -> _Stance:
     if "stance" not in body.memo:
-        body.memo["stance"] = mesh_masses(body), sole_boxes(body)
+        try:
+            masses = mesh_masses(body)
+        except InputError:  # a mesh that encloses nothing: its segments still have girth and length
+            masses = volume_masses(mass_volumes(body))
+        body.memo["stance"] = masses, sole_boxes(body)
     masses, soles = body.memo["stance"]
     return _Stance(masses, soles, floor.at(np.asarray(motion.root, float)))
 
