@@ -10,11 +10,13 @@ from motionfit.adapt._controls import Turn
 from motionfit.adapt._forearm import forearm, multi_start
 from motionfit.adapt._limbs import limbs
 from motionfit.adapt._limits import reference_depths
+from motionfit.adapt._per_frame import per_frame_ik, smoothed_corrections
 from motionfit.adapt._procedure import BLOCKS, DEFAULT, adapt, arms, legs
 
 __all__ = [
     "BLOCKS", "DEFAULT", "GROUPS", "Group", "OBJECTIVES", "Sphere", "Turn", "adapt", "arms", "balance",
-    "build_clearance", "collisions", "forearm", "legs", "limbs", "measure_balance", "multi_start", "reference_depths", "volume_depths",
+    "build_clearance", "collisions", "forearm", "legs", "limbs", "measure_balance", "multi_start", "per_frame_ik",
+    "reference_depths", "smoothed_corrections", "volume_depths",
 ]  # fmt: skip
 
 
