@@ -22,7 +22,7 @@ from motionfit._motion import Motion, resample
 from motionfit.adapt import build_clearance, reference_depths, volume_depths
 from motionfit.adapt._clearance import reduced, support
 from motionfit.adapt._controls import arm_controls
-from motionfit.adapt._limbs import SOLVE_PROBES, _jerk_scale
+from motionfit.adapt._limbs import SOLVE_PROBES, jerk_scale
 from motionfit.metrics import TOLERANCE, derivative_ratio
 from motionfit.shape.pairs import pairs_of
 from motionfit.splines import Basis, bspline_basis, knots_at_extrema, knots_basis, refined_knots
@@ -47,7 +47,7 @@ class Arm:
         controls = tuple(c for c in arm_controls(self.character, self.base, basis) if c.name.startswith("left"))
         score = support(self.clearance, self.base, self.own)
         terms = {"clearance": reduced(self.clearance, score, self.own + ALLOWED, SOLVE_PROBES), "effort": Effort(1.0),
-                 "smoothness": Smoothness(_jerk_scale(self.base))}  # fmt: skip
+                 "smoothness": Smoothness(jerk_scale(self.base))}  # fmt: skip
         problem = mf.Problem(self.character, self.base, terms, controls)
         block = mf.Block("arm", tuple(c.name for c in controls), max_steps=24, tolerance=1e-3)
         fit = mf.fit(problem, (block,), correction=Correction.zero(controls))

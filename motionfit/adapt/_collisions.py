@@ -20,9 +20,9 @@ from motionfit._onto import onto
 from motionfit._problem import During, Problem, Robust
 from motionfit._skeleton import SIDES
 from motionfit._types import InputError
-from motionfit.adapt._clearance import Clearance, _counted_probes, _of, _over_time, _row_depths, reduced, support
+from motionfit.adapt._clearance import Clearance, counted_probes, kept_with, over_time, reduced, row_depths, support
 from motionfit.adapt._controls import Turn, turn_controls
-from motionfit.adapt._limbs import _jerk_scale, _smooth_floor
+from motionfit.adapt._limbs import jerk_scale, smooth_floor
 from motionfit.adapt._record import recorded
 from motionfit.adapt._sampling import Sampling, sampling
 from motionfit.metrics import TOLERANCE, derivative_ratio
@@ -90,7 +90,7 @@ def _hands(side: str, other: str) -> tuple[Group, ...]:
     return (
         Group(f"{hand}/torso", (f"{side}_upper_arm", *arm), ("torso",), turns),
         Group(f"{hand}/head", arm, ("head",), turns),
-        Group(f"{hand}/shoulder", arm, (f"{other}_upper_arm", f"{other}_forearm"), turns),
+        Group(f"{hand}/shoulder", arm, (f"{other}_upper_arm", f"{other}_forearm", f"{other}_hand"), turns),
         Group(f"{hand}/legs", arm, tuple(f"{s}_thigh" for s in SIDES), turns),
     )
 
@@ -114,7 +114,7 @@ class Known(NamedTuple):
     def depths(self, motion: Motion) -> Float[np.ndarray, "frames rows"]:
         """Depth [m] of each row in each frame; negative where there is a gap."""
         frames = motion.frame_count
-        rows = np.asarray(_over_time(_row_depths, self.clearance.term, padded(motion, bucket(frames)), None), float)
+        rows = np.asarray(over_time(row_depths, self.clearance.term, padded(motion, bucket(frames)), None), float)
         return rows.reshape(-1, rows.shape[-1])[:frames] + self.radius
 
 
@@ -158,9 +158,9 @@ def known_depths(character: Character, groups: Sequence[Group]) -> Known:
                 pairs.append(Pair(name, avoid, group.name))
                 parts.append(name)
                 radius.append(0.0 if isinstance(probe, str) else probe.radius)
-                probes.append(_of(character, _counted_probes, probe, avoid) if isinstance(probe, str)
+                probes.append(kept_with(character, counted_probes, probe, avoid) if isinstance(probe, str)
                               else _at_sphere(character, probe))  # fmt: skip
-    term = SkinClearance(tuple(probes), tuple(_of(character, fit_field, *key) for key in fields), tuple(field_of),
+    term = SkinClearance(tuple(probes), tuple(kept_with(character, fit_field, *key) for key in fields), tuple(field_of),
                          (np.zeros((1, 1)),) * len(probes))  # fmt: skip
     return Known(Clearance(term, tuple(pairs), tuple(range(len(pairs))), tuple(parts)), np.array(radius))
 
@@ -201,17 +201,17 @@ def _solve(
     names, real = tuple(c.name for c in controls), np.arange(len(at.rows)) < count
     score = support(known.clearance, small, limit)
     seen = dataclasses.replace(motion[at.rows], dt=np.asarray(at.dt))
-    smooth, history = _jerk_scale(motion), []
+    smooth, history = jerk_scale(motion), []
     tries = [(_faults(worst, np.where(touching, -before - TOUCH, 0.0)), so_far, before)]
     by_field = [[i for i, owner in enumerate(known.clearance.term.field_of) if owner == k]
                 for k in range(len(known.clearance.term.fields))]  # fmt: skip
     for _ in range(ROUNDS):
-        smoothed = _smooth_floor(allowed, at.dt) - known.radius
-        clear = reduced(known.clearance, score, _filled(smoothed, at, 1e3), PROBES)
+        smoothed = smooth_floor(allowed, at.dt) - known.radius
+        clear = reduced(known.clearance, score, filled(smoothed, at, 1e3), PROBES)
         # the probes of a field are one set: a touch by any of them is a touch
         near = np.stack([weight[:, rows].max(axis=1) for rows in by_field], axis=1)
         wish = np.stack([gap[:, rows].min(axis=1) for rows in by_field], axis=1)
-        terms = {"collisions": clear, "touch": Robust(SkinContact(clear, _filled(wish, at, 1e3), _filled(near, at, 0.0))),
+        terms = {"collisions": clear, "touch": Robust(SkinContact(clear, filled(wish, at, 1e3), filled(near, at, 0.0))),
                  "effort": During(Effort(EFFORT), real.astype(float)),
                  "smoothness": During(Smoothness(smooth), (np.arange(len(at.rows)) < count - 2).astype(float))}  # fmt: skip
         problem = Problem(character, seen, terms, points.controls)
@@ -257,7 +257,7 @@ def on_top(so_far: Fit, mine: Correction, at: Sampling) -> Fit:
     return dataclasses.replace(so_far, correction=whole, motion=whole.apply(base), base=base)
 
 
-def _filled(rows: np.ndarray, at: Sampling, value: float) -> np.ndarray:
+def filled(rows: np.ndarray, at: Sampling, value: float) -> np.ndarray:
     return np.concatenate([rows, np.full((len(at.rows) - len(rows), rows.shape[1]), value)])
 
 

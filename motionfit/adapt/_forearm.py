@@ -17,9 +17,9 @@ from motionfit._onto import onto
 from motionfit._problem import During, Problem
 from motionfit._skeleton import SIDES
 from motionfit.adapt._clearance import reduced, support
-from motionfit.adapt._collisions import Group, _filled, known_depths, on_top
+from motionfit.adapt._collisions import Group, filled, known_depths, on_top
 from motionfit.adapt._controls import Turn, turn_controls
-from motionfit.adapt._limbs import SOLVE_PROBES, _jerk_scale, _smooth_floor
+from motionfit.adapt._limbs import SOLVE_PROBES, jerk_scale, smooth_floor
 from motionfit.adapt._record import recorded
 from motionfit.adapt._sampling import sampling
 from motionfit.metrics import TOLERANCE, derivative_ratio
@@ -86,10 +86,10 @@ def _side(clip: Motion, character: Character, so_far: Fit, reference: Character 
     controls = turn_controls(motion, at.whole, forearm_turns(side))
     seen = dataclasses.replace(motion[at.rows], dt=np.asarray(at.dt))
     points = Correction.zero(tuple(at.control(c) for c in controls))
-    names, smooth, history = tuple(c.name for c in controls), _jerk_scale(motion), []
+    names, smooth, history = tuple(c.name for c in controls), jerk_scale(motion), []
     best = (told["error_before_rad"], so_far)
     for attempt in range(ROUNDS):
-        free = _filled(_smooth_floor(allowed, at.dt), at, 1e3)
+        free = filled(smooth_floor(allowed, at.dt), at, 1e3)
         terms = {"direction": During(Direction((elbow,), (hand,), target[at.rows]), real.astype(float)),
                  "effort": During(Effort(EFFORT), real.astype(float)),
                  "smoothness": During(Smoothness(smooth), (np.arange(len(at.rows)) < count - 2).astype(float)),

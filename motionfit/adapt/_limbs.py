@@ -110,7 +110,7 @@ def limbs(
     allowed = np.where(quiet, np.maximum(before, own), kept)
 
     stages = _stages(character, blocks, pairs, objective, allowed, quiet)
-    smooth, history, correction, moved = _jerk_scale(base), [], Correction.zero(seen.controls), small
+    smooth, history, correction, moved = jerk_scale(base), [], Correction.zero(seen.controls), small
     steps = sweeps * len(stages)
 
     def told(round_: int):
@@ -203,7 +203,7 @@ def _problem(
     for stage in stages:
         # however much the skin shows: a part that is LEAST_GAP away from the other's field is pushed no further
         limit = np.maximum(stage.allowed - beyond[:, stage.columns], -LEAST_GAP)
-        limit = np.where(stage.quiet, stage.allowed, _smooth_floor(limit, float(seen.motion.dt)))
+        limit = np.where(stage.quiet, stage.allowed, smooth_floor(limit, float(seen.motion.dt)))
         # the frames that only fill the bucket cost nothing
         limit = np.concatenate([limit, np.full((length - real, limit.shape[1]), 1e3)])
         name = f"{stage.block.name}_clearance"
@@ -219,7 +219,7 @@ def _problem(
     return Problem(character, seen.padded, terms, seen.controls)
 
 
-def _jerk_scale(base: Motion) -> float:
+def jerk_scale(base: Motion) -> float:
     """[rad/s^3] of a shoulder that adds as much jerk at the hand as the clip has itself, noise left out."""
     dt = float(base.dt)
     hands = [j for s in SIDES if (j := base.skeleton.find(f"{s}_hand")) is not None]
@@ -230,7 +230,7 @@ def _jerk_scale(base: Motion) -> float:
     return JERK_SHARE * max(jerk, LEAST_JERK) / LEVER
 
 
-def _smooth_floor(limit: Float[np.ndarray, "frames pairs"], dt: float) -> Float[np.ndarray, "frames pairs"]:
+def smooth_floor(limit: Float[np.ndarray, "frames pairs"], dt: float) -> Float[np.ndarray, "frames pairs"]:
     """The limit without its jumps, nowhere above it by much: what a spline can follow without a jerk."""
     width = max(1, round(0.05 / dt))
     return gaussian_filter1d(minimum_filter1d(limit, 2 * width + 1, axis=0), width, axis=0, mode="nearest")
