@@ -19,7 +19,7 @@ from motionfit._skeleton import SIDES
 from motionfit._types import InputError
 from motionfit.adapt._clearance import build_clearance, volume_depths
 from motionfit.adapt._controls import lean_controls
-from motionfit.adapt._limits import reference_depths
+from motionfit.adapt._limits import ENOUGH, reference_depths
 from motionfit.adapt._record import recorded
 from motionfit.adapt._sampling import Sampling, sampling
 from motionfit.balance import WINDOW, Soles, ZmpDistance, balance_measures, sole_boxes, zmp_distance
@@ -202,14 +202,14 @@ def _jerk(motion: Motion) -> float:
 
 
 def _sinking(clip: Motion, character: Character, reference: Character | None, so_far: Motion, at: Sampling):
-    """Says of a motion whether some pair shows more than the tolerance, and more than before the block."""
+    """Says of a motion whether some pair shows nearly as much as the tolerance, and more than before the block."""
     clearance = build_clearance(character, PAIRS)
     limit, _ = reference_depths(clip[at.frames], character, reference, PAIRS)
     before = volume_depths(clearance, at.motion(so_far)) - limit
 
     def sinks(motion: Motion) -> bool:
         now = volume_depths(clearance, at.motion(motion)) - limit
-        return bool((now > np.maximum(before + 0.001, TOLERANCE)).any())
+        return bool((now > np.maximum(before + 0.001, ENOUGH * TOLERANCE)).any())
 
     return sinks
 
