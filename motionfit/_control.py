@@ -82,7 +82,7 @@ class Correction(eqx.Module):
     """
 
     controls: tuple[Control, ...]
-    points: tuple[Float[AnyArray, " points"], ...]
+    points: tuple[Float[AnyArray, " _"], ...]  # controls may have bases of their own
 
     @classmethod
     def zero(cls, controls: tuple[Control, ...]) -> "Correction":

@@ -67,6 +67,22 @@ def padded(motion: Motion, frame_count: int) -> Motion:
     return motion[np.minimum(np.arange(frame_count), motion.frame_count - 1)]
 
 
+def continued(motion: Motion, frame_count: int) -> Motion:
+    """The motion going on past its end, turned half round about its last frame (an odd reflection): positions and
+    rotations go on at the speed they have there, so that filters near the end see no stop."""
+    frames, last = np.arange(frame_count), motion.frame_count - 1
+    mirror = np.clip(np.where(frames > last, 2 * last - frames, frames), 0, last)
+    beyond = frames > last
+    root, rotations = np.asarray(motion.root, float)[mirror], np.asarray(motion.rotations, float)[mirror]
+    root[beyond] = 2 * root[last] - root[beyond]
+    end = Rotation.from_quat(rotations[last], scalar_first=True)
+    for joint in range(rotations.shape[1]):
+        back = Rotation.from_quat(rotations[beyond, joint], scalar_first=True)
+        rotations[beyond, joint] = (end[joint] * back.inv() * end[joint]).as_quat(scalar_first=True)
+    translations = None if motion.translations is None else motion.translations[mirror]
+    return Motion(motion.skeleton, root, rotations, motion.dt, translations)
+
+
 def resample(motion: Motion, frame_rate: float) -> Motion:
     """The clip at another frame rate [1/s]: positions linearly, rotations along the shortest arc (SciPy Slerp)."""
     if frame_rate <= 0:

@@ -184,7 +184,7 @@ class Objective(eqx.Module):
     terms: tuple[Term | Energy, ...]
     weights: tuple[Float[AnyArray, ""], ...]
 
-    def signals(self, points: tuple[Float[AnyArray, " points"], ...]) -> Float[Array, "frames controls"]:
+    def signals(self, points: tuple[Float[AnyArray, " _"], ...]) -> Float[Array, "frames controls"]:
         """The value of every control in every frame [rad]."""
         if not self.controls:
             return jnp.zeros((self.motion.root.shape[0], 0))
@@ -199,7 +199,7 @@ class Objective(eqx.Module):
             signals = jnp.zeros((motion.root.shape[0], len(self.controls)))
         return forward_kinematics(self.skeleton, motion, signals)
 
-    def costs(self, points: tuple[Float[AnyArray, " points"], ...]) -> tuple[Float[Array, ""], ...]:
+    def costs(self, points: tuple[Float[AnyArray, " _"], ...]) -> tuple[Float[Array, ""], ...]:
         """1/2 w sum r^2 or w E of each term: the cost convention of _types.py."""
         kin = self.kinematics(self.signals(points))
         return tuple(w * term_cost(t, kin) for t, w in zip(self.terms, self.weights, strict=True))

@@ -155,7 +155,7 @@ def zero_moment_point(
     masses: Masses,
     *,
     spin: bool = True,
-    ground: float | Float[AnyArray, "*ground"] = 0.0,
+    ground: float | Float[AnyArray, "*frames"] = 0.0,
     window: float | Float[AnyArray, ""] = WINDOW,
 ) -> Zmp:
     """The zero-moment point: thesis 4.7, after Takanishi & Kato.
@@ -174,9 +174,11 @@ def zero_moment_point(
 
 @eqx.filter_jit
 def _zero_moment_point(kin, masses, ground, window, spin: bool) -> Zmp:
-    com, _, acceleration = smooth_derivatives(centre_of_mass(kin, masses), kin.dt, window)
+    com = centre_of_mass(kin, masses)
     total = jnp.sum(jnp.asarray(masses.mass)).astype(com.dtype)
-    _, moment, _ = smooth_derivatives(angular_momentum(kin, masses, spin) / total, kin.dt, window)
+    both = jnp.concatenate([com, angular_momentum(kin, masses, spin) / total], axis=-1)
+    smoothed, rates, seconds = smooth_derivatives(both, kin.dt, window)
+    com, moment, acceleration = smoothed[:, :3], rates[:, 3:], seconds[:, :3]
     load = acceleration[:, 1] / GRAVITY + 1.0
     held = GRAVITY * jnp.maximum(load, FLIGHT)
     floor = jnp.broadcast_to(jnp.asarray(ground, com.dtype), load.shape)
@@ -248,6 +250,16 @@ def hull_distance(
     anchor = jnp.take_along_axis(corners, jnp.argmax(present, axis=-1)[..., None, None], axis=-2)
     # relative to the point: what is left of a long path's coordinates keeps its digits
     p = jnp.where(jnp.asarray(present)[..., None], corners, anchor) - point[..., None, :]
+    first, second, along, within = _nearest_edge(jax.lax.stop_gradient(p))
+    # which point of which edge is nearest is a minimum: to first order the distance does not depend on the choice
+    a, b = (jnp.take_along_axis(p, k[..., None, None], axis=-2)[..., 0, :] for k in (first, second))
+    distance = rotation.safe_norm(a + along[..., None] * (b - a))
+    return jnp.where(some, jnp.where(within, -distance, distance), 0.0)
+
+
+def _nearest_edge(p: Float[Array, "*batch corners 2"]) -> tuple[Array, Array, Array, Array]:
+    """The hull's edge nearest to the origin: its corners, how far along it (0..1), and whether the origin is inside."""
+    count = p.shape[-2]
     a, edge = p[..., :, None, :], p[..., None, :, :] - p[..., :, None, :]
     length = rotation.safe_norm(edge)
     to_all = p[..., None, None, :, :] - a[..., None, :]
@@ -255,17 +267,18 @@ def hull_distance(
     left = jnp.all(side >= -1e-6 * length[..., None], axis=-1)  # within 1 um of the line counts as on it
     is_edge = left & (length > 1e-6)
     along = -jnp.sum(a * edge, axis=-1) / jnp.where(length > 1e-6, length * length, 1.0)
-    gap = rotation.safe_norm(a + jnp.clip(along, 0.0, 1.0)[..., None] * edge)
-    # a corner by itself is part of the hull, never nearer than it: it serves where there is no edge
-    candidate = is_edge | jnp.eye(corners.shape[-2], dtype=bool)
-    outside = jnp.min(jnp.where(candidate, gap, jnp.inf), axis=(-2, -1))
+    along = jnp.clip(along, 0.0, 1.0)
+    gap = rotation.safe_norm(a + along[..., None] * edge)
     inner = jnp.where(is_edge, edge[..., 1] * a[..., 0] - edge[..., 0] * a[..., 1] >= 0, True)
     # corners all on one line make edges both ways, and enclose nothing
     flat = jnp.max(jnp.where(is_edge[..., None], side - 1e-6 * length[..., None], -1.0), axis=(-3, -2, -1)) <= 0
     within = jnp.all(inner, axis=(-2, -1)) & ~flat
-    depth = jnp.min(jnp.where(is_edge, gap, jnp.inf), axis=(-2, -1), where=is_edge, initial=jnp.inf)
-    depth = jnp.where(within, depth, 0.0)
-    return jnp.where(some, jnp.where(within, -depth, outside), 0.0)
+    # a corner by itself is part of the hull, never nearer than it: it serves where there is no edge
+    candidate = is_edge | (jnp.eye(count, dtype=bool) & ~within[..., None, None])
+    flattened = jnp.where(candidate, gap, jnp.inf).reshape(*gap.shape[:-2], count * count)
+    nearest = jnp.argmin(flattened, axis=-1)
+    along = jnp.take_along_axis(along.reshape(flattened.shape), nearest[..., None], axis=-1)[..., 0]
+    return nearest // count, nearest % count, along, within
 
 
 def nearest_in_hull(
@@ -329,7 +342,7 @@ def zmp_distance(
     planted: Bool[AnyArray, "frames feet"],
     *,
     spin: bool = True,
-    ground: float | Float[AnyArray, "*ground"] = 0.0,
+    ground: float | Float[AnyArray, "*frames"] = 0.0,
     window: float | Float[AnyArray, ""] = WINDOW,
 ) -> ZmpDistance:
     """How far the ZMP is from the support in every frame.

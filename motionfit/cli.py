@@ -13,6 +13,7 @@ from typing import Annotated
 
 import typer
 
+DEFAULT_BLOCKS = "arms,legs,footskate,balance"  # motionfit.adapt.DEFAULT, which takes seconds to import
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False,
                   help="Adapt motion clips to the shape of a character.")  # fmt: skip
 
@@ -48,7 +49,9 @@ def adapt(
         str | None, typer.Option(help="PART=SCALE,… e.g. arms=1.3,trunk=1.5; one number grows all")
     ] = None,
     reference: Annotated[str | None, typer.Option(help="the body that the clip was made for")] = None,
-    blocks: Annotated[str, typer.Option(help="some of arms,legs,footskate; all; or none")] = "all",
+    blocks: Annotated[
+        str, typer.Option(help="some of arms,legs,forearm,collisions,footskate,balance; all; or none")
+    ] = DEFAULT_BLOCKS,
     objective: Annotated[str, typer.Option(help="vertex, capsule or joint")] = "vertex",
     fps: Annotated[float | None, typer.Option(help="resample the clip to this frame rate [1/s]")] = None,
     start: Annotated[float | None, typer.Option(help="cut the clip from here [s]")] = None,
@@ -168,7 +171,7 @@ def footskate(
 
 def run_adapt(
     clip: str, character: str, *, out: pathlib.Path, girth: str | None = None, reference: str | None = None,
-    blocks: str = "all", objective: str = "vertex", fps: float | None = None, start: float | None = None,
+    blocks: str = DEFAULT_BLOCKS, objective: str = "vertex", fps: float | None = None, start: float | None = None,
     end: float | None = None, unit: float | None = None, up: str | None = None, roles: pathlib.Path | None = None,
     report: pathlib.Path | None = None, plot: pathlib.Path | None = None,
 ) -> None:  # fmt: skip
@@ -241,10 +244,11 @@ def run_adapt(
 
 
 def _times(history) -> dict[str, float]:
-    """Seconds per entry of --blocks: both arms are one of them."""
+    """Seconds per entry of --blocks: both arms are one of them, and both forearms."""
     seconds: dict[str, float] = {}
     for report in history:
-        name = "arms" if report.name.endswith("_arm") else report.name
+        name = report.name.partition("_")[2]
+        name = {"arm": "arms", "forearm": "forearm"}.get(name, report.name)
         seconds[name] = seconds.get(name, 0.0) + report.time_s
     return seconds
 

@@ -42,7 +42,7 @@ def with_legs_apart(motion: mf.Motion, mean: float = 0.08, swing: float = 0.02) 
 
 def test_feet_that_stand_are_left_alone(average):
     motion = swaying(average)
-    fit = footskate(so_far(average, motion, motion), average)
+    fit = footskate(motion, average, so_far(average, motion, motion))
     assert fit.motion is motion and fit.history[-1].status == "nothing_to_do"
 
 
@@ -50,7 +50,7 @@ def test_what_moved_the_root_away_from_its_feet_is_taken_back(average):
     base = swaying(average)
     time = np.arange(base.frame_count)[:, None] * float(base.dt)
     moved = mf.Motion(base.skeleton, base.root + 0.05 * np.sin(2 * time) * [1.0, 0.3, 0.5], base.rotations, base.dt)
-    found = np.asarray(footskate(so_far(average, base, moved), average).motion.root)
+    found = np.asarray(footskate(base, average, so_far(average, base, moved)).motion.root)
     np.testing.assert_allclose(found - found[0], base.root - base.root[0], atol=1e-3)
 
 
@@ -59,7 +59,7 @@ def test_turned_legs_slide_no_more_than_the_source(body, request):
     character = request.getfixturevalue(body)
     base = mf.onto(samples.walk(cycles=3), character.skeleton)
     turned = with_legs_apart(base)
-    fit = footskate(so_far(character, base, turned), character)
+    fit = footskate(base, character, so_far(character, base, turned))
     assert fit.motion.rotations is turned.rotations and fit.base is base
     assert [b.name for b in fit.history] == ["footskate"] and fit.history[0].cost_after < fit.history[0].cost_before
     stance = source_stance(character, base)
@@ -71,21 +71,21 @@ def test_turned_legs_slide_no_more_than_the_source(body, request):
     assert after["slide_p95_m_s"] * dt < source["slide_p95_m_s"] * dt + MARGIN
     assert after["ground_penetration_max_m"] < source["ground_penetration_max_m"] + MARGIN
     assert (derivative_ratio(fit.motion, turned, 3) or 9.0) < 1.05
-    again = footskate(so_far(character, fit.motion, fit.motion), character)
+    again = footskate(fit.motion, character, so_far(character, fit.motion, fit.motion))
     np.testing.assert_allclose(again.motion.root, fit.motion.root, atol=1e-4)
 
 
 def test_legs_that_follow_their_feet_leave_the_root_and_the_balance(heavy):
     base = mf.onto(samples.walk(cycles=3), heavy.skeleton)
     turned = with_legs_apart(base, swing=0.04)
-    by_root, by_legs = (footskate(so_far(heavy, base, turned), heavy, legs=k).motion for k in (False, True))
+    by_root, by_legs = (footskate(base, heavy, so_far(heavy, base, turned), legs=k).motion for k in (False, True))
     stance = source_stance(heavy, base)
     source, root, legs = (measure_standing(heavy, m, stance) for m in (base, by_root, by_legs))
     assert legs["feet"]["slide_path_m"] < 1.1 * source["feet"]["slide_path_m"]
     assert legs["feet"]["ground_penetration_max_m"] < source["feet"]["ground_penetration_max_m"] + MARGIN
     assert legs["balance"]["zmp_distance_mean_m"] < 0.5 * root["balance"]["zmp_distance_mean_m"]
     assert joint_angles(by_legs, turned).mean() < np.radians(1)
-    same = footskate(so_far(heavy, by_legs, by_legs), heavy, legs=True).motion
+    same = footskate(by_legs, heavy, so_far(heavy, by_legs, by_legs), legs=True).motion
     assert same.rotations is by_legs.rotations
     np.testing.assert_allclose(same.root, by_legs.root, atol=1e-4)
 
@@ -96,7 +96,7 @@ def test_short_clips_and_clips_in_the_air(average):
     up = mf.Motion(walk.skeleton, rising, walk.rotations, walk.dt)
     for motion in (walk[:1], walk[:3], up):
         for legs in (False, True):
-            fit = footskate(so_far(average, motion, with_legs_apart(motion)), average, legs=legs)
+            fit = footskate(motion, average, so_far(average, motion, with_legs_apart(motion)), legs=legs)
             assert np.isfinite(np.asarray(fit.motion.root)).all() and np.isfinite(fit.motion.rotations).all()
 
 
@@ -167,11 +167,11 @@ def test_no_more_slide_than_the_source_on_a_real_clip(shared_data):
     body = mf.load_character(shared_data / "characters" / "heavy_male.glb")
     for name in ("02_01_walk", "16_36_run", "16_05_forward_jump"):
         base = mf.onto(mf.load_motion(shared_data / "bvh" / f"{name}.bvh"), body.skeleton)
-        fit = footskate(so_far(body, base, with_legs_apart(base)), body)
+        fit = footskate(base, body, so_far(body, base, with_legs_apart(base)))
         stance = source_stance(body, base)
         source, after = (measure_standing(body, m, stance)["feet"] for m in (base, fit.motion))
         assert after["slide_path_m"] < 1.1 * source["slide_path_m"], name
         assert after["slide_p95_m_s"] * float(base.dt) < source["slide_p95_m_s"] * float(base.dt) + MARGIN, name
         assert after["ground_penetration_max_m"] < source["ground_penetration_max_m"] + MARGIN, name
-        again = footskate(so_far(body, fit.motion, fit.motion), body)
+        again = footskate(fit.motion, body, so_far(body, fit.motion, fit.motion))
         np.testing.assert_allclose(again.motion.root, fit.motion.root, atol=1e-4, err_msg=name)

@@ -475,7 +475,7 @@ def test_zmp_margin_asks_for_nothing_that_the_original_did_not_have(heavy):
     kept = _margin(heavy, motion, planted, threshold=np.asarray(original.outside))
     residual = eqx.filter_jit(lambda term: term.residual(kin))
     np.testing.assert_allclose(residual(kept), 0.0, atol=1e-9)
-    assert not kept.frame_local
+    assert kept.reach is None and _margin(heavy, motion, planted, frames_around=9).reach == 9
     stricter = _margin(heavy, motion, planted, threshold=np.asarray(original.outside), scale=0.5)
     rows = np.asarray(residual(stricter))
     assert (rows >= 0).all() and rows.max() > 0.1

@@ -105,7 +105,7 @@ def test_no_permission(monkeypatch, capsys, tmp_path):
 
 def test_options_say_what_is_allowed(monkeypatch, capsys, tmp_path):
     for more, fact in (
-        (("--blocks", "arms,nose"), "blocks: arms, legs"), (("--objective", "magic"), "vertex, capsule, joint"),
+        (("--blocks", "arms,nose"), "blocks: arms, legs, forearm"), (("--objective", "magic"), "vertex, capsule, joint"),
         (("--girth", "arms"), "arms=1.3"), (("--girth", "nose=2"), "parts: arms, legs, trunk"),
         (("--girth", "arms=99"), "0.1 to 5"), (("--fps", "0"), "frame rate"), (("--start", "90"), "start 90"),
     ):  # fmt: skip

@@ -9,7 +9,7 @@ import motionfit as mf
 from motionfit import samples
 from motionfit._motion import rest_motion
 from motionfit.adapt import build_clearance
-from motionfit.adapt._clearance import _row_depths
+from motionfit.adapt._clearance import row_depths
 from motionfit.shape.pairs import pairs_of
 from motionfit.splines import bspline_basis
 from motionfit.terms.penetration import hinge
@@ -30,7 +30,7 @@ def _problem(term, character, motion, joints=("left_upper_arm", "right_thigh", "
 
 def signed_depths(clearance, kin):
     """Depth [m] per frame and pair, negative for a gap."""
-    rows = np.asarray(_row_depths(clearance.term, kin, None))
+    rows = np.asarray(row_depths(clearance.term, kin, None))
     owner = np.array(clearance.pair_of_row)
     return np.stack([rows[:, owner == k].max(axis=1) for k in range(len(clearance.pairs))], axis=1)
 

@@ -45,3 +45,10 @@ RADIUS_SCALE = {
     "head": (0.85, 0.98), "right_arm": (0.97, 1.36), "left_arm": (0.90, 1.29), "trunk": (1.08, 0.90),
     "left_leg": (0.97, 1.04), "right_leg": (0.98, 1.14),
 }  # fmt: skip
+
+# Table 5.6, [cm] (SD): mean distance of the ZMP from its support, original, corrected and balanced
+BALANCED: dict[str, tuple[str, str, str]] = {
+    "Walk": ("8.38 (7.78)", "10.06 (7.45)", "7.35 (7.46)"), "Jump": ("11.27 (3.66)", "11.31 (3.64)", "11.17 (3.61)"),
+    "Skip": ("6.60 (7.28)", "6.61 (7.31)", "3.72 (4.51)"), "Another walk": ("4.71 (6.14)", "5.54 (6.19)", "4.73 (6.44)"),
+    "Scanned body walk": ("5.11 (7.64)", "5.14 (7.64)", "4.49 (7.06)"),
+}  # fmt: skip

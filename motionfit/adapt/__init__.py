@@ -3,17 +3,23 @@
 import sys
 import types
 
+from motionfit.adapt._balance import balance
 from motionfit.adapt._clearance import OBJECTIVES, build_clearance, volume_depths
+from motionfit.adapt._collisions import GROUPS, Group, Sphere, collisions
+from motionfit.adapt._controls import Turn
 from motionfit.adapt._feet import footskate
+from motionfit.adapt._forearm import forearm, multi_start
 from motionfit.adapt._limbs import limbs
 from motionfit.adapt._limits import reference_depths
 from motionfit.adapt._many import adapt_many
-from motionfit.adapt._procedure import BLOCKS, adapt, arms, legs
+from motionfit.adapt._per_frame import per_frame_ik, smoothed_corrections
+from motionfit.adapt._procedure import BLOCKS, DEFAULT, adapt, arms, legs
 from motionfit.adapt._standing import measure_standing, source_stance
 
 __all__ = [
-    "BLOCKS", "OBJECTIVES", "adapt", "adapt_many", "arms", "build_clearance", "footskate", "legs", "limbs",
-    "measure_standing", "reference_depths", "source_stance", "volume_depths",
+    "BLOCKS", "DEFAULT", "GROUPS", "Group", "OBJECTIVES", "Sphere", "Turn", "adapt", "adapt_many", "arms", "balance",
+    "build_clearance", "collisions", "footskate", "forearm", "legs", "limbs", "measure_standing", "multi_start",
+    "per_frame_ik", "reference_depths", "smoothed_corrections", "source_stance", "volume_depths",
 ]  # fmt: skip
 
 

@@ -74,14 +74,14 @@ def _vertex(character: Character, pairs: tuple[Pair, ...]) -> Clearance:
     # whose arm and thigh pull at a trunk depends on the side that comes near it
     met = [(b, a.partition("_")[0] if b == "torso" else "left") for _, a, b in directed]
     hit = list(dict.fromkeys(met))
-    fields = tuple(_of(character, fit_field, *key) for key in hit)
-    probes = tuple(_of(character, _counted_probes, a, b) for _, a, b in directed)
+    fields = tuple(kept_with(character, fit_field, *key) for key in hit)
+    probes = tuple(kept_with(character, counted_probes, a, b) for _, a, b in directed)
     term = SkinClearance(probes, fields, tuple(hit.index(key) for key in met),
                          (np.zeros((1, 1)),) * len(directed))  # fmt: skip
     return Clearance(term, pairs, tuple(k for k, _, _ in directed), tuple(a for _, a, _ in directed))
 
 
-def _of(character: Character, make, *parts: str):
+def kept_with(character: Character, make, *parts: str):
     """`make(character, *parts)`, once per character."""
     key = (make.__name__, *parts)
     if key not in character.memo:
@@ -89,7 +89,7 @@ def _of(character: Character, make, *parts: str):
     return character.memo[key]
 
 
-def _counted_probes(character: Character, part: str, against: str):
+def counted_probes(character: Character, part: str, against: str):
     """Skin points of a part that lie outside the other part at bind: those inside are the joint itself.
 
     A third of them are the deepest ones with the arms hanging, where there are such: the fold of an armpit is small.
@@ -161,7 +161,7 @@ CHUNK = 1024  # frames looked at at once: what bounds the memory of long clips
 
 
 @eqx.filter_jit
-def _over_time(look, term: Term, motion: Motion, allowed: Float[Array, "frames rows"] | None):
+def over_time(look, term: Term, motion: Motion, allowed: Float[Array, "frames rows"] | None):
     """`look(term, kinematics, allowed)` chunk after chunk of frames."""
     frames = motion.root.shape[0]
     pieces = -(-frames // CHUNK)
@@ -178,7 +178,7 @@ def _over_time(look, term: Term, motion: Motion, allowed: Float[Array, "frames r
     return jax.lax.map(at, order)
 
 
-def _row_depths(term: Term, kin: Kinematics, allowed) -> Float[Array, "frames rows"]:
+def row_depths(term: Term, kin: Kinematics, allowed) -> Float[Array, "frames rows"]:
     del allowed
     if isinstance(term, JointClearance):
         return jnp.asarray(term.min_distance) - term.distance(kin)
@@ -198,7 +198,7 @@ def _support(term: SkinClearance, kin: Kinematics, allowed) -> Float[Array, "set
 def volume_depths(clearance: Clearance, motion: Motion) -> Float[np.ndarray, "frames pairs"]:
     """Depth [m] of every pair in every frame on the volumes, 0 where they are apart."""
     frames = motion.frame_count
-    rows = np.asarray(_over_time(_row_depths, clearance.term, padded(motion, bucket(frames)), None), float)
+    rows = np.asarray(over_time(row_depths, clearance.term, padded(motion, bucket(frames)), None), float)
     rows = rows.reshape(-1, rows.shape[-1])[:frames]
     owner = np.array(clearance.pair_of_row)
     depth = np.stack([rows[:, owner == k].max(axis=1) for k in range(len(clearance.pairs))], axis=1)
@@ -212,7 +212,7 @@ def support(
     frames = bucket(motion.frame_count)
     rows = allowed[:, list(clearance.pair_of_row)]
     rows = jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], frames - len(rows), axis=0)]), float)
-    return np.asarray(_over_time(_support, clearance.term, padded(motion, frames), rows)).sum(axis=0)
+    return np.asarray(over_time(_support, clearance.term, padded(motion, frames), rows)).sum(axis=0)
 
 
 def reduced(

@@ -1,5 +1,8 @@
 """The controls of each block: which joints turn, about which axes."""
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
@@ -8,6 +11,7 @@ from motionfit._character import Character
 from motionfit._control import Control, Drive
 from motionfit._motion import Motion, host_kinematics
 from motionfit._skeleton import SIDES, Skeleton
+from motionfit._types import InputError
 from motionfit.splines import Basis
 
 UP = np.array([0.0, 1.0, 0.0])
@@ -58,6 +62,91 @@ def leg_controls(character: Character, motion: Motion, basis: Basis) -> tuple[Co
     apart = tuple(Drive(j, _in_parent(skeleton, world, j, forward), gain) for j, gain in ((left, 1.0), (right, -1.0)))
     return (Control("hip_turn", turn, basis, -np.pi / 8, np.pi / 8),
             Control("thighs_apart", apart, basis, -np.pi / 4, np.pi / 4))  # fmt: skip
+
+
+def lean_controls(character: Character, motion: Motion, basis: Basis, gaze: bool = True) -> tuple[Control, ...]:
+    """Ankle against thigh, and the spine, each sideways and forward: thesis 4.7.3, bounds (4.13).
+
+    `lean_*` turns both thighs one way and both feet back, so that trunk and soles keep their orientation: seen from
+    the feet, the hips move. `spine_*` bends the trunk, shared evenly by the spine's joints; with `gaze` the head
+    turns back. Positive is to the left, and forward. Axes are level and follow the hips' heading.
+    """
+    skeleton = character.skeleton
+    positions, world = host_kinematics(motion)
+    left, right = (skeleton.joint(f"{s}_thigh") for s in SIDES)
+    across = _smooth((positions[:, left] - positions[:, right]) * np.array([1.0, 0.0, 1.0]), motion)
+    forward = np.cross(across, UP)
+    spine, controls = skeleton.chain("spine"), []
+
+    def drives(axis: np.ndarray, joints: tuple[int, ...], gain: float) -> tuple[Drive, ...]:
+        return tuple(Drive(j, _in_parent(skeleton, world, j, axis), gain) for j in joints)
+
+    legs = [tuple(skeleton.joint(f"{s}_{r}") for s in SIDES) for r in ("thigh", "foot")]
+    head = (skeleton.joint("head"),) if gaze and skeleton.find("head") is not None else ()
+    # about `forward` a positive turn takes what is up to the right, about `across` to the front
+    for name, axis, up in (("sideways", forward, -1.0), ("forward", across, 1.0)):
+        lean = drives(axis, legs[0], up) + drives(axis, legs[1], -up)
+        controls.append(Control(f"lean_{name}", lean, basis, -np.pi / 8, np.pi / 8))
+        if spine:
+            bend = drives(axis, spine, up / len(spine)) + drives(axis, head, -up)
+            controls.append(Control(f"spine_{name}", bend, basis, -np.pi / 8, np.pi / 8))
+    return tuple(controls)
+
+
+class Turn(NamedTuple):
+    """A control as data: each drive names a role, an axis and a gain, and `bound` [rad] holds both ways.
+
+    Axes are directions of the trunk, "left", "up" and "forward", or of the limb itself: "bend", about which it bends
+    over the clip (positive: more), "swing", across that and the bone, and "twist", about the bone itself. A bend never stretches a limb beyond straight.
+    """
+
+    name: str
+    drives: tuple[tuple[str, str, float], ...]
+    bound: float = np.pi / 2
+
+
+def turn_controls(motion: Motion, basis: Basis, turns: Sequence[Turn]) -> tuple[Control, ...]:
+    """The controls of some turns: axes smooth in the world, as those of the arms."""
+    skeleton = motion.skeleton
+    positions, world = host_kinematics(motion)
+    line = _smooth(positions[:, skeleton.joint("chest")] - positions[:, skeleton.joint("hips")], motion)
+    arms = positions[:, skeleton.joint("left_upper_arm")] - positions[:, skeleton.joint("right_upper_arm")]
+    left = _smooth(arms - (arms * line).sum(-1, keepdims=True) * line, motion)
+    trunk = {"left": left, "up": line, "forward": np.cross(left, line)}
+    controls = []
+    for turn in turns:
+        drives, lower = [], -turn.bound
+        for role, name, gain in turn.drives:
+            joint = skeleton.joint(role)
+            if name in ("bend", "swing"):
+                axis, least = _limb_axis(motion, positions, world, joint, name)
+                lower = max(lower, -least) if name == "bend" else lower
+            elif name == "twist":
+                axis = _smooth(positions[:, skeleton.children(joint)[0]] - positions[:, joint], motion)
+            elif name in trunk:
+                axis = trunk[name]
+            else:
+                raise InputError(f"unknown axis {name!r} of {turn.name}; axes: {', '.join(trunk)}, bend, swing, twist")
+            drives.append(Drive(joint, _in_parent(skeleton, world, joint, axis), gain))
+        controls.append(Control(turn.name, tuple(drives), basis, lower, turn.bound))
+    return tuple(controls)
+
+
+def _limb_axis(
+    motion: Motion, positions: np.ndarray, world: np.ndarray, joint: int, name: str
+) -> tuple[np.ndarray, float]:
+    """A limb's bend or swing axis in the world, per frame, and its least bend over the clip [rad].
+
+    The bend axis is that of the whole clip, fixed in the upper bone: a straight limb has none of its own."""
+    skeleton = motion.skeleton
+    above = Rotation.from_quat(world[:, skeleton.parents[joint]], scalar_first=True)
+    upper = _unit(positions[:, joint] - positions[:, skeleton.parents[joint]])
+    lower = _unit(positions[:, skeleton.children(joint)[0]] - positions[:, joint])
+    hinge = above.inv().apply(np.cross(upper, lower)).sum(0)
+    bend = _smooth(above.apply(_unit(hinge)), motion)
+    angle = np.arctan2((np.cross(upper, lower) * bend).sum(-1), (upper * lower).sum(-1))
+    axis = bend if name == "bend" else _unit(np.cross(bend, _smooth(lower, motion)))
+    return axis, float(max(angle.min(), 0.0))
 
 
 def _in_parent(skeleton: Skeleton, rotations_world: np.ndarray, joint: int, axis_world: np.ndarray) -> np.ndarray:

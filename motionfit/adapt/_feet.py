@@ -28,10 +28,12 @@ ROUNDS = 6  # of drift removal: a foot that stands better is seen to stand a lit
 SIGMA = 0.001  # [m] of slide in a frame, and of height, that costs one half in the report
 
 
-def footskate(fit: Fit, character: Character, *, legs: bool = False) -> Fit:
-    """The fit with a root path on which no planted foot skates; every rotation is the very same array.
+def footskate(
+    clip: Motion, character: Character, so_far: Fit, *, reference: Character | None = None, legs: bool = False
+) -> Fit:
+    """The fit so far with a root path on which no planted foot skates; every rotation is the very same array.
 
-    The feet are planted where they are in the source, `fit.base`. What the blocks before did to a carrying foot's path
+    The feet are planted where they are in the source, `so_far.base`. What the blocks before did to a carrying foot's path
     and to the height of the lower foot is taken back; then the drift of the carrying foot is taken out, until
     none drifts by more than a centimetre in a stance. A clip in which none does, and whose legs no block turned, comes
     back as it was. Tremor stays: `motionfit.remove_footskate` holds a foot in every frame, at the price of jerk.
@@ -40,13 +42,14 @@ def footskate(fit: Fit, character: Character, *, legs: bool = False) -> Fit:
     not sway, and the zero-moment point stays near the support, but thighs and shanks turn by a degree or two away from
     what kept them apart, and the correction's own rotations are no longer the motion's.
     """
+    del clip, reference  # the feet are the character's own
     started = time.perf_counter()
     try:
         sole = find_sole(character)
     except InputError as error:
         raise InputError(f"{error}; or leave footskate out of the blocks") from None
-    motion = fit.motion
-    plants, evidence = detect(sole, fit.base)
+    motion = so_far.motion
+    plants, evidence = detect(sole, so_far.base)
     dt = plants.dt
     source, first = evidence.paths_world, sole_paths(sole, motion)
     if legs:
@@ -59,18 +62,20 @@ def footskate(fit: Fit, character: Character, *, legs: bool = False) -> Fit:
         shift[:, 1] = 0.0
         shift[:, 1] = rise + plants.floor.at(shift) - plants.floor.height  # a floor may be tilted
         # what drifts is judged by the plants that the result itself shows: so it stays as it is when adapted again
-        same = motion is fit.base and not shift.any()
+        same = motion is so_far.base and not shift.any()
         seen, found = (plants, evidence) if same else detect(sole, _moved(motion, shift))
         more = stop_drift(sole, before + shift[:, None], found.speed, rows_of(sole, seen.carrier), seen)
         if not more.any() or rounds == ROUNDS:
             break
         shift += more
     costs = [_costs(sole, plants, paths, source) for paths in (first, before + shift[:, None])]
-    status = "nothing_to_do" if motion is fit.motion and not shift.any() else "max_steps" if more.any() else "converged"
+    status = (
+        "nothing_to_do" if motion is so_far.motion and not shift.any() else "max_steps" if more.any() else "converged"
+    )
     report = BlockReport("footskate", 0, status, rounds, *(sum(c.values()) for c in costs), *costs,
                          time.perf_counter() - started)  # fmt: skip
     result = _moved(motion, shift) if shift.any() else motion
-    return dataclasses.replace(fit, motion=result, history=(*fit.history, report))
+    return dataclasses.replace(so_far, motion=result, history=(*so_far.history, report))
 
 
 def _moved(motion: Motion, shift: Float[np.ndarray, "frames 3"]) -> Motion:

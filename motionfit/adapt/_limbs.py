@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
 from motionfit._character import Character
 from motionfit._control import Control, Correction
 from motionfit._fit import Block, Fit, fit
-from motionfit._motion import Motion, bucket, host_kinematics
+from motionfit._motion import Motion, host_kinematics
 from motionfit._onto import onto
 from motionfit._problem import During, Problem, Term
 from motionfit._skeleton import SIDES
@@ -19,15 +19,15 @@ from motionfit._types import InputError
 from motionfit.adapt._clearance import Clearance, allowance, build_clearance, reduced, support, volume_depths
 from motionfit.adapt._controls import arm_controls, leg_controls
 from motionfit.adapt._limits import ENOUGH, SkinLooks, reference_depths
+from motionfit.adapt._sampling import SOLVE_RATE, sampling
 from motionfit.metrics import TOLERANCE, derivative_ratio
 from motionfit.shape.pairs import Pair, pairs_of
-from motionfit.splines import Basis, bspline_basis
+from motionfit.splines import Basis
 from motionfit.terms.pose import Effort, Smoothness, Steadiness
 
 LIMBS = ("arms", "legs")
 
-SOLVE_RATE = 30.0  # [1/s] of the frames that the solver sees: three for every knot
-KNOT_SPACING = 0.1  # [s]
+RATE = 30.0  # [1/s] of the frames that the solver sees: three for every knot
 SOLVE_PROBES = {"upper_arm": 20, "forearm": 16, "hand": 12, "thigh": 20, "calf": 20}  # per pair, of those looked at
 ALLOWED_EXCESS = 0.004  # [m] that may stay where more was; well under TOLERANCE, which the skin is judged by
 MARGIN = 0.001  # [m]
@@ -92,7 +92,7 @@ def limbs(
 ) -> Fit:
     """Take the arms out of the trunk and the thighs, and the legs out of each other.
 
-    The solver sees 60 frames per second, and the skin's probes that matter. Afterwards all probes are looked at, with
+    The solver sees 30 frames per second, and the skin's probes that matter. Afterwards all probes are looked at, with
     a reference also the skinned mesh itself at some frames, and the jerk; where more than the tolerance is left the
     volumes get less room, where the jerk grew the correction gets smoother, and the blocks run again from where they
     were.
@@ -131,7 +131,7 @@ def limbs(
     allowed = np.where(quiet, np.maximum(before, own), kept)
 
     stages = _stages(character, blocks, pairs, objective, allowed, quiet)
-    smooth, history, moved = _jerk_scale(base), [], small
+    smooth, history, moved = jerk_scale(base), [], small
     points = Correction.zero(seen.controls).points if start is None else start.correction.points
     # a whole clip has no more control points than the bucket that the solver sees
     correction = Correction(seen.controls, tuple(_filled(p, seen.basis.count) for p in points))
@@ -214,26 +214,13 @@ def _controls(character: Character, base: Motion, blocks: Sequence[str]) -> tupl
 
     Knots lie on the same instants in both, so the control points are the same.
     """
-    step = max(1, round(base.frame_rate / SOLVE_RATE))
-    frames = np.arange(0, base.frame_count, step)
-    small = dataclasses.replace(base[frames], dt=np.asarray(base.dt, float) * step)
-    length = bucket(len(frames))
-    rows = frames[np.minimum(np.arange(length), len(frames) - 1)]
-    basis = bspline_basis(length, float(small.dt), KNOT_SPACING)
-    every = max(1, round(KNOT_SPACING / float(small.dt))) * step
-    whole = bspline_basis(base.frame_count, float(base.dt), every * float(base.dt))
+    at = sampling(base, rate=RATE)
+    whole = at.whole
     controls = (*(arm_controls(character, base, whole) if "arms" in blocks else ()),
                 *(leg_controls(character, base, whole) if "legs" in blocks else ()))  # fmt: skip
 
-    def as_seen(control: Control) -> Control:
-        drives = tuple(
-            dataclasses.replace(d, axis_parent=d.axis_parent[rows]) if np.ndim(d.axis_parent) == 2 else d
-            for d in control.drives
-        )
-        return dataclasses.replace(control, drives=drives, basis=basis)
-
-    padded = dataclasses.replace(base[rows], dt=small.dt)
-    return controls, whole, Seen(frames, small, padded, basis, tuple(as_seen(c) for c in controls))
+    padded = dataclasses.replace(base[at.rows], dt=np.asarray(at.dt))
+    return controls, whole, Seen(at.frames, at.motion(base), padded, at.basis, tuple(at.control(c) for c in controls))
 
 
 def _final(controls: Sequence[Control], basis: Basis, correction: Correction) -> Correction:
@@ -273,7 +260,7 @@ def _problem(
     for stage in stages:
         # however much the skin shows: a part that is LEAST_GAP away from the other's field is pushed no further
         limit = np.maximum(stage.allowed - beyond[:, stage.columns], -LEAST_GAP)
-        limit = np.where(stage.quiet, stage.allowed, _smooth_floor(limit, float(seen.motion.dt)))
+        limit = np.where(stage.quiet, stage.allowed, smooth_floor(limit, float(seen.motion.dt)))
         # the frames that only fill the bucket cost nothing
         limit = np.concatenate([limit, np.full((length - real, limit.shape[1]), 1e3)])
         name = f"{stage.block.name}_clearance"
@@ -291,7 +278,7 @@ def _problem(
     return Problem(character, seen.padded, terms, seen.controls)
 
 
-def _jerk_scale(base: Motion) -> float:
+def jerk_scale(base: Motion) -> float:
     """[rad/s^3] of a shoulder that adds as much jerk at the hand as the clip has itself, noise left out."""
     dt = float(base.dt)
     hands = [j for s in SIDES if (j := base.skeleton.find(f"{s}_hand")) is not None]
@@ -307,7 +294,7 @@ def _wake(stage: Stage, woken: Bool[np.ndarray, " pairs"], kept: Float[np.ndarra
     return stage._replace(quiet=stage.quiet & ~woken, allowed=np.where(woken, kept, stage.allowed))
 
 
-def _smooth_floor(limit: Float[np.ndarray, "frames pairs"], dt: float) -> Float[np.ndarray, "frames pairs"]:
+def smooth_floor(limit: Float[np.ndarray, "frames pairs"], dt: float) -> Float[np.ndarray, "frames pairs"]:
     """The limit without its jumps, nowhere above it by much: what a spline can follow without a jerk."""
     width = max(1, round(0.05 / dt))
     return gaussian_filter1d(minimum_filter1d(limit, 2 * width + 1, axis=0), width, axis=0, mode="nearest")

@@ -10,7 +10,7 @@ from motionfit._character import Character
 from motionfit._fit import Fit
 from motionfit._motion import Motion
 from motionfit.adapt._clearance import OBJECTIVES
-from motionfit.adapt._procedure import BLOCKS, adapt
+from motionfit.adapt._procedure import DEFAULT, adapt
 
 
 def adapt_many(
@@ -18,7 +18,7 @@ def adapt_many(
     bodies: Iterable[Character],
     *,
     reference: Character | None = None,
-    blocks: Sequence[str] = BLOCKS,
+    blocks: Sequence[str] = DEFAULT,
     objective: str = OBJECTIVES[0],
     workers: int | None = None,
     progress: Callable[[int], None] | None = None,

@@ -1,5 +1,6 @@
 """`adapt`: a clip and a character in, an adapted clip out. The whole procedure of thesis 5.2, block after block."""
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 
 from motionfit._character import Character
@@ -9,13 +10,18 @@ from motionfit._motion import Motion
 from motionfit._onto import onto
 from motionfit._problem import Problem
 from motionfit._types import InputError
+from motionfit.adapt._balance import balance
+from motionfit.adapt._collisions import collisions
 from motionfit.adapt._feet import footskate
+from motionfit.adapt._forearm import forearm
 from motionfit.adapt._limbs import LIMBS, limbs
 from motionfit.shape.growth import grow
 
 Progress = Callable[[str, int, int], None]
 
-BLOCKS = (*LIMBS, "footskate")
+LATER = {"forearm": forearm, "collisions": collisions, "footskate": footskate, "balance": balance}
+BLOCKS = (*LIMBS, *LATER)
+DEFAULT = ("arms", "legs", "footskate", "balance")  # the others cost more than they change on most clips
 
 
 def adapt(
@@ -24,7 +30,7 @@ def adapt(
     *,
     reference: Character | None = None,
     girth: Mapping[str, float] | None = None,
-    blocks: Sequence[str] = BLOCKS,
+    blocks: Sequence[str] = DEFAULT,
     objective: str = "vertex",
     sweeps: int = 1,
     start: Fit | None = None,
@@ -34,9 +40,12 @@ def adapt(
 
     The clip is put on the character (`motionfit.onto`), then the blocks run in the order of thesis 5.2: `arms` keeps
     upper arms, forearms and hands out of the trunk and the thighs, the left arm first, `legs` the thighs and calves
-    apart, `footskate` the planted feet where they are, by the root alone. Penetration counts as far as it exceeds
-    what the same clip shows on `reference`, the body that it was made for; without one, on the character before
-    `girth`, else in its rest pose.
+    apart; `forearm` brings the forearms back to where they pointed; `collisions` takes hands out of head, other arm
+    and legs, and keeps touches that were meant; `footskate` keeps the planted feet where they are, by the root alone;
+    `balance` keeps the zero-moment point as near to the support as it was. Each has options of its own as
+    `motionfit.adapt.forearm` and so on, which go on from a `Fit`. Penetration counts as far as it exceeds what the same
+    clip shows on `reference`, the body that it was made for; without one, on the character before `girth`, else in
+    its rest pose.
 
     `start` is an earlier fit of the same clip, to a body that is alike: the solver starts from its correction.
 
@@ -49,14 +58,21 @@ def adapt(
     if girth:
         reference, character = reference or character, grow(character, girth)
     base = onto(clip, character.skeleton)
-    first = tuple(b for b in LIMBS if b in blocks)
+    first, later = (tuple(b for b in some if b in blocks) for some in (LIMBS, LATER))
+    parts = bool(first) + len(later)
+
+    def told(part: int, name: str, done: int, total: int) -> None:
+        if progress is not None:
+            progress(name, round(100 * (part + done / total) / parts), 100)
+
     if first:
         fit = limbs(clip, character, reference=reference, blocks=first, objective=objective, sweeps=sweeps,
-                    start=start, progress=progress)  # fmt: skip
+                    start=start, progress=functools.partial(told, 0))  # fmt: skip
     else:
         fit = Fit(Correction((), ()), base, base, "converged", (), Problem(character, base, {}, ()))
-    if "footskate" in blocks:
-        fit = footskate(fit, character)
+    for k, name in enumerate(later, start=bool(first)):
+        fit = LATER[name](clip, character, fit, reference=reference)
+        told(k, name, 1, 1)
     return fit
 
 

@@ -7,9 +7,9 @@ import numpy as np
 from motionfit._character import Character
 from motionfit._motion import Motion, forward_kinematics
 from motionfit._types import InputError
-from motionfit.balance import ZmpDistance, balance_measures, sole_boxes, zmp_distance
+from motionfit.balance import Soles, ZmpDistance, balance_measures, sole_boxes, zmp_distance
 from motionfit.feet import Footplants, detect, find_sole, measure_feet
-from motionfit.shape.mass import mesh_masses
+from motionfit.shape.mass import Masses, mass_volumes, mesh_masses, volume_masses
 
 
 class Stance(NamedTuple):
@@ -45,6 +45,18 @@ def measure_standing(character: Character, motion: Motion, stance: Stance) -> di
     return {"feet": feet, "balance": None if distance is None else balance_measures(distance, stance.reference)}
 
 
+def weighed(body: Character) -> tuple[Masses, Soles]:
+    """Segment masses and sole boxes, kept with the body. Of a mesh that encloses nothing the segments still have
+    girth and length."""
+    if "weighed" not in body.memo:
+        try:
+            masses = mesh_masses(body)
+        except InputError:
+            masses = volume_masses(mass_volumes(body))
+        body.memo["weighed"] = masses, sole_boxes(body)
+    return body.memo["weighed"]
+
+
 def _plants(character: Character, motion: Motion) -> Footplants | None:
     try:
         return detect(find_sole(character), motion)[0]
@@ -59,10 +71,8 @@ def _distance(
     if down is None or own is None:
         return None
     try:
-        if "weighed" not in character.memo:
-            character.memo["weighed"] = mesh_masses(character), sole_boxes(character)
+        masses, soles = weighed(character)
     except InputError:
         return None
-    masses, soles = character.memo["weighed"]
     kin = forward_kinematics(character.skeleton, motion)
     return zmp_distance(kin, masses, soles, down.planted, ground=own.floor.at(np.asarray(motion.root, float)))

@@ -1,17 +1,20 @@
 """Built-in terms: wishes about a motion, as residuals over Kinematics."""
 
-from motionfit.terms.balance import ZmpMargin
-from motionfit.terms.penetration import CapsuleClearance, JointClearance, SkinClearance
-from motionfit.terms.pose import Effort, JointTracking, RotationTracking, Smoothness, Steadiness
+from motionfit.terms.balance import Standing, ZmpMargin
+from motionfit.terms.penetration import CapsuleClearance, JointClearance, SkinClearance, SkinContact
+from motionfit.terms.pose import Direction, Effort, JointTracking, RotationTracking, Smoothness, Steadiness
 
 __all__ = [
     "CapsuleClearance",
+    "Direction",
     "Effort",
     "JointClearance",
     "JointTracking",
     "RotationTracking",
     "SkinClearance",
+    "SkinContact",
     "Smoothness",
+    "Standing",
     "Steadiness",
     "ZmpMargin",
 ]

@@ -127,3 +127,21 @@ class SkinClearance(Term):
     def residual(self, kin: Kinematics) -> Float[Array, "frames points"]:
         excess = [d - jnp.asarray(a) for d, a in zip(self.point_depths(kin), self.allowed, strict=True)]
         return hinge(jnp.concatenate(excess, axis=-1), self.width) / self.sigma
+
+
+class SkinContact(Term):
+    """Parts that touch go on touching: the deepest point of a set no farther from the other part's skin than `gap` [m].
+
+    The counterpart of `SkinClearance`, whose probes and fields it has. `gap` is per frame and set, and `weight` (0..1)
+    says in which frames there is a touch to keep: an intended contact, such as a hand on the hip. `sigma` [m].
+    """
+
+    skin: SkinClearance
+    gap: Float[AnyArray, "frames sets"]
+    weight: Float[AnyArray, "frames sets"]
+    sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.01)
+    width: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.002)
+
+    def residual(self, kin: Kinematics) -> Float[Array, "frames sets"]:
+        apart = -self.skin.depth(kin) - jnp.asarray(self.gap)
+        return jnp.asarray(self.weight) * hinge(apart, self.width) / self.sigma

@@ -86,3 +86,23 @@ class RotationTracking(Term):
     def residual(self, kin: Kinematics) -> Float[Array, "frames tracked 3"]:
         turned = kin.rotations_world[:, np.array(self.joints)]
         return rotation.log(rotation.multiply(rotation.conjugate(self.target_world), turned)) / self.sigma
+
+
+class Direction(Term):
+    """Bones that point where they pointed: unit directions from `start` joints to `end` joints less the target's.
+
+    The sum of squares is 2 sum (1 - cos angle): thesis (4.7), -sum (H - E).(h - e), but for constants. `sigma` is a
+    chord: for small angles [rad].
+    """
+
+    start: tuple[int, ...] = eqx.field(static=True)
+    end: tuple[int, ...] = eqx.field(static=True)
+    target_world: Float[AnyArray, "frames bones 3"]
+    sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.1)
+
+    def directions(self, kin: Kinematics) -> Float[Array, "frames bones 3"]:
+        bones = jnp.asarray(kin.positions_world)[:, np.array(self.end)]
+        return rotation.normalize(bones - jnp.asarray(kin.positions_world)[:, np.array(self.start)])
+
+    def residual(self, kin: Kinematics) -> Float[Array, "frames bones 3"]:
+        return (self.directions(kin) - jnp.asarray(self.target_world)) / self.sigma

@@ -1,0 +1,233 @@
+"""The block that keeps a motion as balanced as it was, on a body of other masses: thesis 4.7."""
+
+import dataclasses
+import warnings
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
+
+from motionfit._character import Character
+from motionfit._control import Control, Correction
+from motionfit._fit import Block, Fit, fit
+from motionfit._motion import Motion, continued, forward_kinematics, host_kinematics
+from motionfit._onto import onto
+from motionfit._problem import During, Problem
+from motionfit._skeleton import SIDES
+from motionfit._types import InputError
+from motionfit.adapt._clearance import build_clearance, volume_depths
+from motionfit.adapt._controls import lean_controls
+from motionfit.adapt._limits import ENOUGH, reference_depths
+from motionfit.adapt._record import recorded
+from motionfit.adapt._sampling import Sampling, sampling
+from motionfit.adapt._standing import weighed
+from motionfit.balance import WINDOW, Soles, ZmpDistance, zmp_distance
+from motionfit.feet._leg import Leg, find_legs, turn_legs
+from motionfit.feet._remove import detect_footplants
+from motionfit.metrics import TOLERANCE, derivative_ratio
+from motionfit.shape.mass import Masses
+from motionfit.shape.pairs import PAIRS
+from motionfit.terms.balance import Standing, ZmpMargin
+from motionfit.terms.pose import Effort, Smoothness
+
+ALLOWED_EXCESS = 0.005  # [m] beyond its threshold that a frame may keep: what the filter's choice alone makes
+MEAN_ENOUGH = 0.0005  # [m] of mean distance more than the source's, what may be left
+MOST_LEFT = 0.001  # [m] the same, before it counts as a violation
+CARTOON = 0.9  # thesis 4.7.3: thresholds scaled by less lean the character more than one would
+EFFORT = 0.3  # [rad]
+JERK_SHARE = 0.5  # of the source's own jerk, what the hips may get at the cost of 1 per frame
+LEAST_JERK = 10.0  # [m/s^3] for clips that stand still
+LEVER = 0.9  # [m] ankle to hip
+MOST_JERK = 1.04  # ratio to that of the motion before the block
+PASS_OVER = 0.08  # [s] within which the weight goes from one foot to the other
+STRETCH = 0.998  # of a leg's length, as far as it may be stretched: straight legs leave no way to shift the hips
+ROUNDS = 5
+
+
+class _Stance(NamedTuple):
+    """What of a body and its floor does not change: masses, soles, and the height [m] of the floor in each frame."""
+
+    masses: Masses
+    soles: Soles
+    ground: Float[np.ndarray, " frames"]
+
+
+def balance(
+    clip: Motion, character: Character, so_far: Fit, *, reference: Character | None = None, scale: float = 1.0,
+    gaze: bool = True,
+) -> Fit:  # fmt: skip
+    """Bring the zero-moment point no farther from the support than the clip has it on `reference`, frame by frame.
+
+    Masses come from both bodies' shapes. The character leans over the ankles and bends the spine, (4.12), on top of
+    `so_far`; the feet stay where they are in every frame, planted or not: the legs follow by the analytic leg.
+    Without a reference the thresholds are those of the clip before any correction on the character itself. `scale`
+    multiplies them: below 0.9 it looks like a cartoon. `gaze` keeps the head's orientation.
+
+    A clip that is balanced enough comes back as it was. `details["balance"]` holds the mean distance [m] of the source,
+    and before and after; the root's way lies in the fit's `base`.
+    """
+    if not 0.0 <= scale <= 2.0:
+        raise InputError(f"thresholds can be scaled by 0 to 2, got {scale:g}")
+    if scale < CARTOON:
+        warnings.warn(f"thresholds scaled by {scale:g}: below {CARTOON} the character leans more than one would, and "
+                      "looks like a cartoon", stacklevel=2)  # fmt: skip
+    motion = so_far.motion
+    source, body = (so_far.base, character) if reference is None else (onto(clip, reference.skeleton), reference)
+    plants = detect_footplants(source, body)
+    planted = np.asarray(plants.planted)
+    at = sampling(motion)
+    own_stance = _stance(body, source, plants.floor)
+    stance = _stance(character, motion, detect_footplants(motion, character).floor)
+    own = _distance(body, source, own_stance, planted, at)
+    threshold = np.asarray(own.outside)
+    before = _distance(character, motion, stance, planted, at)
+    wanted = _mean(own, scale * threshold)
+
+    def done(result: Fit, after: ZmpDistance) -> Fit:
+        told = {"zmp_distance_source_m": _mean(own, threshold), "zmp_distance_before_m": _mean(before),
+                "zmp_distance_after_m": _mean(after), "supported_frames": int(np.asarray(after.supported).sum())}  # fmt: skip
+        return dataclasses.replace(result, details={**so_far.details, "balance": told})
+
+    excess = np.where(before.supported, np.asarray(before.outside) - scale * threshold, 0.0)
+    if excess.max(initial=0.0) <= 2 * ALLOWED_EXCESS and _mean(before) <= wanted + MEAN_ENOUGH:
+        return done(so_far, before)
+
+    controls = lean_controls(character, motion, at.whole, gaze)
+    feet = tuple(character.skeleton.joint(f"{s}_foot") for s in SIDES)
+    share = _share(planted, float(motion.dt))
+    term = ZmpMargin(stance.masses, stance.soles, _padded(planted[at.frames], at, False), np.zeros(len(at.rows)),
+                     ground=stance.ground[at.rows], frames_around=round(5 * WINDOW / at.dt) + 1)  # fmt: skip
+    seen = continued(at.motion(motion), len(at.rows))
+    home = host_kinematics(seen)[0][:, list(feet)]
+    sinks = _sinking(clip, character, reference, motion, at)
+    limit, points = scale * threshold + ALLOWED_EXCESS, Correction.zero(tuple(at.control(c) for c in controls))
+    smooth = JERK_SHARE * max(_jerk(motion), LEAST_JERK) / LEVER
+    effort, history = EFFORT, []
+    real = np.arange(len(at.rows)) < len(at.frames)
+    for _ in range(ROUNDS):
+        zmp = eqx.tree_at(lambda z: z.threshold, term, _padded(limit, at, 0.0))
+        terms = {"balance": Standing(zmp, feet, home, share[at.rows]),
+                 "effort": During(Effort(effort), real.astype(float)),
+                 "smoothness": During(Smoothness(smooth), real.astype(float))}  # fmt: skip
+        problem = Problem(character, seen, terms, points.controls)
+        solved = fit(problem, (Block("balance", tuple(c.name for c in controls), max_steps=24, tolerance=1e-3),),
+                     correction=points)  # fmt: skip
+        points, history = solved.correction, [*history, *solved.history]
+        result = _stood(so_far, controls, at, points, feet, share)
+        after = _distance(character, result.motion, stance, planted, at)
+        jerk = derivative_ratio(result.motion, motion, 3) or 1.0
+        sunk = sinks(result.motion)
+        if _mean(after) <= wanted + MEAN_ENOUGH and jerk <= MOST_JERK and not sunk:
+            break
+        if jerk > MOST_JERK:
+            smooth *= 0.5
+        if sunk:
+            effort *= 0.5
+        if _mean(after) > wanted + MEAN_ENOUGH:
+            left = np.where(after.supported, np.asarray(after.outside) - scale * threshold, 0.0)
+            limit = limit - np.maximum(left, 0.0)
+    for part in (0.5, 0.25, 0.0) if sunk else ():
+        # rather less balanced than a part in another
+        result = _stood(so_far, controls, at, points, feet, share, part)
+        after, sunk = _distance(character, result.motion, stance, planted, at), sinks(result.motion)
+        if not sunk:
+            break
+    reached = _mean(after) <= wanted + MOST_LEFT
+    return done(dataclasses.replace(result, history=(*so_far.history, *history),
+                                    status=so_far.status if reached else "violations_left"), after)  # fmt: skip
+
+
+def _padded(rows: np.ndarray, at: Sampling, value) -> np.ndarray:
+    """Rows of the frames that are seen, and a value for those that fill the bucket."""
+    more = np.full((len(at.rows) - len(rows), *rows.shape[1:]), value, rows.dtype)
+    return np.concatenate([rows, more])
+
+
+def _stance(body: Character, motion: Motion, floor) -> _Stance:
+    masses, soles = weighed(body)
+    return _Stance(masses, soles, floor.at(np.asarray(motion.root, float)))
+
+
+@eqx.filter_jit
+def _kinematics(skeleton, motion):
+    return forward_kinematics(skeleton, motion)
+
+
+def _distance(body: Character, motion: Motion, stance: _Stance, planted: np.ndarray, at: Sampling) -> ZmpDistance:
+    """Distances of the frames that are seen."""
+    seen, count = continued(at.motion(motion), len(at.rows)), len(at.frames)
+    found = zmp_distance(_kinematics(body.skeleton, seen), stance.masses, stance.soles,
+                         _padded(planted[at.frames], at, False), ground=stance.ground[at.rows])  # fmt: skip
+    return ZmpDistance(np.asarray(found.signed)[:count], np.asarray(found.supported)[:count])
+
+
+def _mean(distance: ZmpDistance, outside: np.ndarray | None = None) -> float:
+    outside = np.asarray(distance.outside) if outside is None else outside
+    supported = np.asarray(distance.supported)
+    return float(outside[supported].mean()) if supported.any() else 0.0
+
+
+def _share(planted: Bool[np.ndarray, "frames 2"], dt: float) -> Float[np.ndarray, "frames 2"]:
+    """How much each foot carries, passing smoothly from one to the other; in flight what is nearer in time."""
+    weight = gaussian_filter1d(planted.astype(float), PASS_OVER / dt, axis=0, mode="nearest") + 1e-3
+    return weight / weight.sum(axis=1, keepdims=True)
+
+
+def _jerk(motion: Motion) -> float:
+    """Mean jerk [m/s^3] of the joints, noise left out."""
+    if motion.frame_count < 4:
+        return 0.0
+    positions = gaussian_filter1d(host_kinematics(motion)[0], 0.016 / float(motion.dt), axis=0, mode="nearest")
+    return float(np.linalg.norm(np.diff(positions, 3, axis=0), axis=-1).mean()) / float(motion.dt) ** 3
+
+
+def _sinking(clip: Motion, character: Character, reference: Character | None, so_far: Motion, at: Sampling):
+    """Says of a motion whether some pair shows nearly as much as the tolerance, and more than before the block."""
+    clearance = build_clearance(character, PAIRS)
+    limit, _ = reference_depths(clip[at.frames], character, reference, PAIRS)
+    before = volume_depths(clearance, at.motion(so_far)) - limit
+
+    def sinks(motion: Motion) -> bool:
+        now = volume_depths(clearance, at.motion(motion)) - limit
+        return bool((now > np.maximum(before + 0.001, ENOUGH * TOLERANCE)).any())
+
+    return sinks
+
+
+def _stood(
+    so_far: Fit, controls: tuple[Control, ...], at: Sampling, points: Correction, feet: tuple[int, ...],
+    share: Float[np.ndarray, "frames 2"], part: float = 1.0,
+) -> Fit:  # fmt: skip
+    """The block's controls, or a part of them, on top of the fit so far, with every foot where it was: the root moves,
+    the legs follow."""
+    motion, skeleton = so_far.motion, so_far.motion.skeleton
+    mine = Correction(controls, tuple(part * np.asarray(p)[: at.whole.count] for p in points.points))
+    leaned = mine.apply(motion)
+    home, turned = host_kinematics(motion)[0][:, list(feet)], host_kinematics(leaned)[0][:, list(feet)]
+    shift = (share[..., None] * (home - turned)).sum(axis=1)
+    positions, rotations = host_kinematics(leaned)
+    legs = find_legs(skeleton, positions + shift[:, None], rotations)
+    shift = shift - _down(legs, find_legs(skeleton, *host_kinematics(motion)), float(motion.dt))
+    legs = find_legs(skeleton, positions + shift[:, None], rotations)
+    local, _ = turn_legs(leaned, legs, [home[:, k] for k in range(2)], rotations)
+    root = np.asarray(motion.root, float) + shift
+    result = Motion(skeleton, root, local, motion.dt, motion.translations)
+    base = dataclasses.replace(so_far.base, root=root)
+    both = Correction((*so_far.correction.controls, *mine.controls), (*so_far.correction.points, *mine.points))
+    joints = sorted({int(d.joint) for c in controls for d in c.drives} | {j for leg in legs for j in leg.joints})
+    whole = recorded("stand", result, base, both, joints)
+    return dataclasses.replace(so_far, correction=whole, motion=whole.apply(base), base=base)
+
+
+def _down(legs: list[Leg], before: list[Leg], dt: float) -> Float[np.ndarray, "frames 3"]:
+    """How far [m] the body comes down so that no leg must be longer than it is, nor straighter than it was."""
+    needed = np.zeros(len(legs[0].hip))
+    for leg, old in zip(legs, before, strict=True):
+        reach = np.maximum(STRETCH * leg.length, np.linalg.norm(old.hip - old.ankle, axis=1))
+        needed = np.maximum(needed, np.linalg.norm(leg.hip - old.ankle, axis=1) - reach)
+    width = 2 * max(1, round(PASS_OVER / dt)) + 1
+    # the mean of a maximum over the same width never falls below the demand
+    down = uniform_filter1d(maximum_filter1d(np.maximum(needed, 0.0), width, mode="nearest"), width, mode="nearest")
+    return down[:, None] * np.array([0.0, 1.0, 0.0])

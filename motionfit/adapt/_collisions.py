@@ -1,0 +1,275 @@
+"""General collisions, by groups that are data: thesis 4.6 and the arguments of appendix E's `removeCollision`.
+
+The arm and leg blocks take out what a shape makes of a motion. What is left comes from the movement itself, for a
+moment: a hand at the head, on the other arm, across the belly. And where a hand touches on purpose, it goes on touching.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d
+
+from motionfit._character import PARTS, Character
+from motionfit._control import Correction
+from motionfit._fit import Block, Fit, fit
+from motionfit._motion import Motion, bind_pose, bucket, padded
+from motionfit._onto import onto
+from motionfit._problem import During, Problem, Robust
+from motionfit._skeleton import SIDES
+from motionfit._types import InputError
+from motionfit.adapt._clearance import Clearance, counted_probes, kept_with, over_time, reduced, row_depths, support
+from motionfit.adapt._controls import Turn, turn_controls
+from motionfit.adapt._limbs import jerk_scale, smooth_floor
+from motionfit.adapt._record import recorded
+from motionfit.adapt._sampling import Sampling, sampling
+from motionfit.metrics import TOLERANCE, derivative_ratio
+from motionfit.shape.field import Probes, fit_field
+from motionfit.shape.pairs import Pair
+from motionfit.terms.penetration import SkinClearance, SkinContact
+from motionfit.terms.pose import Effort, Smoothness
+
+ALLOWED_EXCESS = 0.004  # [m] that may stay where more was
+TOUCH = 0.02  # [m] from the surface: what counts as a touch
+TOUCH_AIM = 0.012  # [m] a touch is brought back to
+EASE = 0.08  # [s] within which a touch is taken up and let go
+EFFORT = 0.5  # [rad]
+MOST_JERK = 1.04
+ROUNDS = 4
+PROBES = {"upper_arm": 20, "forearm": 16, "hand": 16}
+
+
+class Sphere(NamedTuple):
+    """A ball that must stay empty of other parts: at a joint's role, or at a skin `vertex` that moves with it.
+
+    `offset` [m] is added in the bind pose, y up and z ahead; `radius` [m].
+    """
+
+    role: str
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    radius: float = 0.0
+    vertex: int | None = None
+
+    def place_bind(self, character: Character) -> Float[np.ndarray, "3"]:
+        joint = character.skeleton.joint(self.role)
+        if self.vertex is None:
+            start = bind_pose(character.skeleton)[0][joint]
+        else:
+            start = np.asarray(character.skin.vertices_bind, float)[self.vertex]
+        return start + np.asarray(self.offset)
+
+
+class Group(NamedTuple):
+    """What collides with what, and what may turn to avoid it.
+
+    `probes` are parts, whose skin is looked at, or spheres; `avoid` are parts. `turns` are the controls, each of which
+    may drive several joints by the same amount or its inverse. A knot every `spacing` frames that the solver sees (60
+    per second). Groups with the same turns and spacing are solved together, so that none undoes the other.
+    """
+
+    name: str
+    probes: tuple[str | Sphere, ...]
+    avoid: tuple[str, ...]
+    turns: tuple[Turn, ...]
+    spacing: int = 2
+
+
+def arm_turns(side: str) -> tuple[Turn, ...]:
+    """Shoulder about all axes, elbow about its two useful ones."""
+    arm, elbow = f"{side}_upper_arm", f"{side}_forearm"
+    return (*(Turn(f"{arm}_{axis}", ((arm, axis, 1.0),), 0.6) for axis in ("left", "up", "forward")),
+            Turn(f"{elbow}_bend", ((elbow, "bend", 1.0),), 1.0),
+            Turn(f"{elbow}_swing", ((elbow, "swing", 1.0),), 0.35))  # fmt: skip
+
+
+def _hands(side: str, other: str) -> tuple[Group, ...]:
+    arm, hand = (f"{side}_forearm", f"{side}_hand"), f"{side}_hand"
+    turns = arm_turns(side)
+    return (
+        Group(f"{hand}/torso", (f"{side}_upper_arm", *arm), ("torso",), turns),
+        Group(f"{hand}/head", arm, ("head",), turns),
+        Group(f"{hand}/shoulder", arm, (f"{other}_upper_arm", f"{other}_forearm", f"{other}_hand"), turns),
+        Group(f"{hand}/legs", arm, tuple(f"{s}_thigh" for s in SIDES), turns),
+    )
+
+
+def _bent(side: str) -> Group:
+    """The trunk straightens for a leg drawn up: it leaves the feet where they are."""
+    turns = tuple(Turn(f"trunk_{axis}", (("chest", axis, 1.0),), np.pi / 8) for axis in ("left", "forward"))
+    return Group(f"{side}_leg/torso", (f"{side}_calf",), ("torso",), turns)
+
+
+GROUPS: tuple[Group, ...] = (*_hands("left", "right"), *_hands("right", "left"), *(_bent(s) for s in SIDES))
+"""The five tables of the thesis, per side: legs/torso, hands/torso, hands/head, hands/shoulders, hands/legs."""
+
+
+class Known(NamedTuple):
+    """The clearance of some groups on a body, and the radius [m] of each row."""
+
+    clearance: Clearance
+    radius: Float[np.ndarray, " rows"]
+
+    def depths(self, motion: Motion) -> Float[np.ndarray, "frames rows"]:
+        """Depth [m] of each row in each frame; negative where there is a gap."""
+        frames = motion.frame_count
+        rows = np.asarray(over_time(row_depths, self.clearance.term, padded(motion, bucket(frames)), None), float)
+        return rows.reshape(-1, rows.shape[-1])[:frames] + self.radius
+
+
+def collisions(
+    clip: Motion, character: Character, so_far: Fit, *, reference: Character | None = None,
+    groups: Sequence[Group] = GROUPS,
+) -> Fit:  # fmt: skip
+    """Take the groups' probes out of what they shall avoid, as far as they are deeper in than on `reference`.
+
+    Where a hand touched on the reference (within 2 cm), it is brought back to the surface. Without a reference, what
+    the character shows with the clip before any correction may stay and touches. What the arm and leg blocks reached is
+    not undone: their pairs are in the tables. `details["collisions"]` holds per pair the greatest excess [m] before
+    and after, and the share of the touched frames that still touch.
+    """
+    result, told = so_far, {}
+    for some in _together(groups):
+        result, more = _solve(clip, character, result, reference, some)
+        told |= more
+    return dataclasses.replace(result, details={**so_far.details, "collisions": told})
+
+
+def _together(groups: Sequence[Group]) -> list[list[Group]]:
+    found: dict[tuple, list[Group]] = {}
+    for group in groups:
+        found.setdefault((group.turns, group.spacing), []).append(group)
+    return list(found.values())
+
+
+def known_depths(character: Character, groups: Sequence[Group]) -> Known:
+    pairs, probes, fields, field_of, parts, radius = [], [], [], [], [], []
+    for group in groups:
+        for part in (p for p in (*group.avoid, *(q for q in group.probes if isinstance(q, str))) if p not in PARTS):
+            raise InputError(f"group {group.name!r} names unknown part {part!r}; parts: {', '.join(PARTS)}")
+        for probe in group.probes:
+            for avoid in group.avoid:
+                name = probe if isinstance(probe, str) else probe.role
+                side = name.partition("_")[0] if name.startswith(SIDES) and avoid == "torso" else "left"
+                if (avoid, side) not in fields:
+                    fields.append((avoid, side))
+                field_of.append(fields.index((avoid, side)))
+                pairs.append(Pair(name, avoid, group.name))
+                parts.append(name)
+                radius.append(0.0 if isinstance(probe, str) else probe.radius)
+                probes.append(kept_with(character, counted_probes, probe, avoid) if isinstance(probe, str)
+                              else _at_sphere(character, probe))  # fmt: skip
+    term = SkinClearance(tuple(probes), tuple(kept_with(character, fit_field, *key) for key in fields), tuple(field_of),
+                         (np.zeros((1, 1)),) * len(probes))  # fmt: skip
+    return Known(Clearance(term, tuple(pairs), tuple(range(len(pairs))), tuple(parts)), np.array(radius))
+
+
+def _at_sphere(character: Character, sphere: Sphere) -> Probes:
+    place = sphere.place_bind(character)
+    return Probes(np.array([character.skeleton.joint(sphere.role)]), np.append(place, 1.0)[None, :, None])
+
+
+def _solve(
+    clip: Motion, character: Character, so_far: Fit, reference: Character | None, groups: list[Group]
+) -> tuple[Fit, dict]:
+    motion, known = so_far.motion, known_depths(character, groups)
+    at = sampling(motion, groups[0].spacing / 60.0)
+    small, count = at.motion(motion), len(at.frames)
+    if reference is None:
+        own = known.depths(at.motion(so_far.base))
+    else:
+        own = known_depths(reference, groups).depths(at.motion(onto(clip, reference.skeleton)))
+    before = known.depths(small)
+    pairs = known.clearance.pairs
+    inner = np.array([p.adjacent for p in pairs])
+    limit = np.maximum(own, 0.0)
+    # a touch that was meant, by a hand; in the frames around it the hand is on its way
+    touching = (own > -TOUCH) & np.array([p.first.endswith("hand") for p in pairs])
+    told = _told(pairs, before, before, limit, touching, inner)
+    lost = touching & (before < -TOUCH)
+    worst = np.where(inner, 0.0, before - limit)
+    if worst.max(initial=0.0) <= TOLERANCE and not lost.any():
+        return so_far, told
+    # what meets at a joint is the arm block's, which knows its skin: it goes no deeper than it is
+    allowed = np.where(inner, np.maximum(before, 0.0) + 0.001, limit + ALLOWED_EXCESS)
+    weight = gaussian_filter1d(maximum_filter1d(touching.astype(float), 3, axis=0), EASE / at.dt, axis=0)
+    gap = np.full(own.shape, TOUCH_AIM)
+
+    controls = turn_controls(motion, at.whole, [t for t in groups[0].turns])
+    points = Correction.zero(tuple(at.control(c) for c in controls))
+    names, real = tuple(c.name for c in controls), np.arange(len(at.rows)) < count
+    score = support(known.clearance, small, limit)
+    seen = dataclasses.replace(motion[at.rows], dt=np.asarray(at.dt))
+    smooth, history = jerk_scale(motion), []
+    tries = [(_faults(worst, np.where(touching, -before - TOUCH, 0.0)), so_far, before)]
+    by_field = [[i for i, owner in enumerate(known.clearance.term.field_of) if owner == k]
+                for k in range(len(known.clearance.term.fields))]  # fmt: skip
+    for _ in range(ROUNDS):
+        smoothed = smooth_floor(allowed, at.dt) - known.radius
+        clear = reduced(known.clearance, score, filled(smoothed, at, 1e3), PROBES)
+        # the probes of a field are one set: a touch by any of them is a touch
+        near = np.stack([weight[:, rows].max(axis=1) for rows in by_field], axis=1)
+        wish = np.stack([gap[:, rows].min(axis=1) for rows in by_field], axis=1)
+        terms = {"collisions": clear, "touch": Robust(SkinContact(clear, filled(wish, at, 1e3), filled(near, at, 0.0))),
+                 "effort": During(Effort(EFFORT), real.astype(float)),
+                 "smoothness": During(Smoothness(smooth), (np.arange(len(at.rows)) < count - 2).astype(float))}  # fmt: skip
+        problem = Problem(character, seen, terms, points.controls)
+        solved = fit(problem, (Block("collisions", names, max_steps=24, tolerance=1e-3),), correction=points)
+        points, history = solved.correction, [*history, *solved.history]
+        result = on_top(so_far, Correction(controls, points.points), at)
+        moved = at.motion(result.motion)
+        after = known.depths(moved)
+        over = np.where(inner, after - np.maximum(before, limit), after - limit)
+        apart = np.where(touching, -after - TOUCH, 0.0)
+        jerk = derivative_ratio(result.motion, motion, 3) or 1.0
+        if jerk <= MOST_JERK + 0.01:
+            tries.append((_faults(over, apart), result, after))
+        if over.max() <= 0.7 * TOLERANCE and apart.max() <= 0.0 and jerk <= MOST_JERK:
+            break
+        if jerk > MOST_JERK:
+            smooth *= 0.5
+        allowed = allowed - np.where(over > 0.7 * TOLERANCE, np.minimum(over, 0.02), 0.0)
+        gap = gap - np.where(apart > 0.0, np.minimum(apart + 0.003, 0.01), 0.0)
+        score = np.maximum(score, support(known.clearance, moved, limit))
+    # a touch that cannot be had without sinking in elsewhere is given up, and so is all that makes matters worse
+    _, result, after = min(tries, key=lambda t: t[0])
+    told = _told(pairs, before, after, limit, touching, inner)
+    left = np.where(inner, 0.0, after - limit).max() > TOLERANCE
+    return dataclasses.replace(result, history=(*so_far.history, *history),
+                               status="violations_left" if left else so_far.status), told  # fmt: skip
+
+
+def _faults(over: Float[np.ndarray, "frames rows"], apart: Float[np.ndarray, "frames rows"]) -> float:
+    """Share of the frames that show a violation, and of those that lost a touch: what a solve is judged by."""
+    return 2.0 * float((over > TOLERANCE).any(axis=1).mean()) + float((apart > 0.0).mean(axis=0).sum())
+
+
+def on_top(so_far: Fit, mine: Correction, at: Sampling) -> Fit:
+    """More controls on top of a fit's motion: those joints whose turns add up with others' get what is missing."""
+    mine = Correction(mine.controls, tuple(np.asarray(p)[: at.whole.count] for p in mine.points))
+    motion = mine.apply(so_far.motion)
+    both = Correction((*so_far.correction.controls, *mine.controls), (*so_far.correction.points, *mine.points))
+    base = dataclasses.replace(so_far.base, root=so_far.motion.root)
+    joints = sorted({int(d.joint) for c in mine.controls for d in c.drives})
+    name = mine.controls[0].name
+    whole = recorded(name, motion, base, both, joints)
+    return dataclasses.replace(so_far, correction=whole, motion=whole.apply(base), base=base)
+
+
+def filled(rows: np.ndarray, at: Sampling, value: float) -> np.ndarray:
+    return np.concatenate([rows, np.full((len(at.rows) - len(rows), rows.shape[1]), value)])
+
+
+def _told(pairs, before, after, limit, touching, inner) -> dict:
+    told = {}
+    for k, pair in enumerate(pairs):
+        row = {
+            "excess_before_m": float((before - limit)[:, k].max()),
+            "excess_after_m": float((after - limit)[:, k].max()),
+        }
+        if touching[:, k].any():
+            row["touching_before"] = float((before > -TOUCH)[touching[:, k], k].mean())
+            row["touching_after"] = float((after > -TOUCH)[touching[:, k], k].mean())
+        told[pair.name] = row
+    return told

@@ -1,0 +1,34 @@
+"""Write down what a closed form did to a motion, as controls with a value per frame."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from motionfit._control import Control, Correction, Drive
+from motionfit._motion import Motion
+from motionfit.splines import per_frame
+
+
+def recorded(name: str, motion: Motion, base: Motion, correction: Correction, joints: Sequence[int]) -> Correction:
+    """`correction` with one more control per joint, `name_joint`, so that on `base` it gives the rotations of `motion`.
+
+    The rotation vectors of a joint's controls are summed, so what is missing is the whole turn's less the sum.
+    """
+    controls, points = list(correction.controls), list(correction.points)
+    for joint in joints:
+        before, after = (Rotation.from_quat(np.asarray(m.rotations, float)[:, joint], scalar_first=True)
+                         for m in (base, motion))  # fmt: skip
+        missing = (after * before.inv()).as_rotvec()
+        for control, some in zip(correction.controls, correction.points, strict=True):
+            for drive in control.drives:
+                if int(drive.joint) == joint:
+                    signal = np.asarray(control.signal(some), float) * float(drive.gain)
+                    missing = missing - signal[:, None] * np.asarray(drive.axis_parent, float).reshape(-1, 3)
+        angle = np.linalg.norm(missing, axis=1)
+        axis = missing / np.maximum(angle, 1e-12)[:, None]
+        basis = per_frame(base.frame_count)
+        label = f"{name}_{base.skeleton.role_of_joint.get(joint, base.skeleton.names[joint])}"
+        controls.append(Control(label, (Drive(joint, axis, 1.0),), basis, -np.pi, np.pi))
+        points.append(np.concatenate([angle, np.zeros(basis.count - len(angle))]))
+    return Correction(tuple(controls), tuple(points))

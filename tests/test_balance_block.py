@@ -1,0 +1,121 @@
+"""The balance block: the zero-moment point comes back to where it was allowed, the feet stay, and quiet clips too."""
+
+import numpy as np
+import pytest
+
+import motionfit as mf
+from motionfit import samples
+from motionfit._control import Control, Correction, Drive
+from motionfit._motion import Motion, continued, host_kinematics, joint_angles, padded
+from motionfit.adapt._record import recorded
+from motionfit.metrics import derivative_ratio
+from motionfit.splines import bspline_basis, per_frame
+from motionfit.terms import JointTracking, Standing
+from tests.helpers import central_difference, random_motion
+
+PLANTED = 0.002  # [m] that a planted foot may move
+RELATIVE = 1e-5  # analytic against central differences in double precision
+
+
+def _alone(clip, character):
+    base = mf.onto(clip, character.skeleton)
+    return mf.Fit(Correction((), ()), base, base, "converged", (), mf.Problem(character, base, {}, ()))
+
+
+@pytest.fixture(scope="module")
+def leaning(average):
+    """The walk, the trunk bent sideways by 14 degrees at its lowest joint."""
+    walk = samples.walk(cycles=1)
+    joint, basis = average.skeleton.chain("spine")[0], per_frame(walk.frame_count)
+    axis = np.array([0.0, 0.0, 1.0])
+    bent = Correction((Control("bend", (Drive(joint, axis, 1.0),), basis),), (np.full(basis.count, np.deg2rad(14.0)),))
+    return walk, bent.apply(mf.onto(walk, average.skeleton))
+
+
+@pytest.mark.slow
+def test_a_leaning_walk_is_brought_back(leaning, average):
+    walk, bent = leaning
+    so_far = mf.Fit(Correction((), ()), bent, bent, "converged", (), mf.Problem(average, bent, {}, ()))
+    fit = mf.adapt.balance(walk, average, so_far, reference=average)
+    told = fit.details["balance"]
+    assert told["zmp_distance_before_m"] > told["zmp_distance_source_m"] + 0.002
+    assert told["zmp_distance_after_m"] <= told["zmp_distance_source_m"] + 0.001
+    feet = [average.skeleton.joint(f"{s}_{r}") for s in ("left", "right") for r in ("foot", "toe")]
+    before, after = (host_kinematics(m)[0] for m in (bent, fit.motion))
+    assert np.abs(after[:, feet] - before[:, feet]).max() < PLANTED
+    assert derivative_ratio(fit.motion, bent, 3) <= 1.05
+    # the correction alone gives the motion again
+    again = fit.correction.apply(fit.base)
+    np.testing.assert_allclose(joint_angles(again, fit.motion), 0.0, atol=1e-7)
+    np.testing.assert_array_equal(again.root, fit.motion.root)
+
+
+def test_a_clip_on_its_own_body_comes_back(average):
+    walk = samples.walk(cycles=1)
+    so_far = _alone(walk, average)
+    fit = mf.adapt.balance(walk, average, so_far, reference=average)
+    assert fit.motion is so_far.motion and fit.correction is so_far.correction
+
+
+def test_a_scale_that_makes_cartoons_is_said(average):
+    walk = samples.walk(cycles=1)
+    with pytest.warns(UserWarning, match="cartoon"):
+        mf.adapt.balance(walk[:1], average, _alone(walk[:1], average), reference=average, scale=0.5)
+    with pytest.raises(mf.InputError, match="0 to 2"):
+        mf.adapt.balance(walk, average, _alone(walk, average), scale=-1.0)
+
+
+def test_standing_moves_the_body_and_not_the_feet():
+    motion = random_motion(3, 6, 5)
+    kin = mf.forward_kinematics(motion.skeleton, motion)
+    home = np.random.default_rng(0).normal(size=(5, 2, 3))
+    inner = JointTracking((1, 4), np.zeros((5, 2, 3)), 1.0)
+    one_foot = Standing(inner, (4, 5), home, np.tile([1.0, 0.0], (5, 1)))
+    rows = np.asarray(one_foot.residual(kin))
+    np.testing.assert_allclose(rows[:, 1], home[:, 0], atol=1e-12)
+    gap = np.asarray(kin.positions_world[:, 1] - kin.positions_world[:, 4])
+    np.testing.assert_allclose(rows[:, 0] - rows[:, 1], gap, atol=1e-12)
+    assert one_foot.reach == 0
+
+
+def test_its_gradient_is_that_of_finite_differences():
+    import equinox as eqx
+    import jax
+    import jax.numpy as jnp
+
+    motion = random_motion(5, 6, 4)
+    home, share = np.zeros((4, 2, 3)), np.tile([0.7, 0.3], (4, 1))
+    term = Standing(JointTracking((1, 2), np.ones((4, 2, 3)), 1.0), (4, 5), home, share)
+
+    @jax.jit
+    def cost(x):
+        control = Control("c", (Drive(2, np.array([0.0, 0.6, 0.8]), 1.0), Drive(4, np.array([1.0, 0.0, 0.0]), -1.0)),
+                          bspline_basis(4, 1 / 60, 0.1))  # fmt: skip
+        signals = control.signal(x)[:, None]
+        from motionfit._control import turned
+
+        moved = eqx.tree_at(lambda m: m.rotations, motion, turned(motion, (control,), signals))
+        return 0.5 * jnp.sum(term.residual(mf.forward_kinematics(motion.skeleton, moved)) ** 2)
+
+    x = np.array([0.1, -0.2, 0.3, 0.05])
+    np.testing.assert_allclose(jax.grad(cost)(x), central_difference(cost, x), rtol=RELATIVE, atol=1e-8)
+
+
+def test_recorded_gives_the_motion_again(average):
+    base = mf.onto(samples.walk(cycles=1), average.skeleton)
+    rotations = np.array(base.rotations)
+    joints = [average.skeleton.joint(f"left_{r}") for r in ("thigh", "calf")]
+    rotations[:, joints] = rotations[::-1][:, joints]
+    target = Motion(base.skeleton, base.root, rotations, base.dt)
+    found = recorded("x", target, base, Correction((), ()), joints).apply(base)
+    np.testing.assert_allclose(joint_angles(found, target), 0.0, atol=1e-7)
+
+
+def test_a_continued_clip_goes_on_at_its_speed(average):
+    walk = samples.walk(cycles=1)[:30]
+    longer = continued(walk, 40)
+    np.testing.assert_array_equal(longer.root[:30], walk.root)
+    places = host_kinematics(longer)[0]
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=-1)
+    np.testing.assert_allclose(steps[29], steps[28], rtol=0.05, atol=1e-3)
+    np.testing.assert_array_equal(continued(walk, 30).rotations, padded(walk, 30).rotations)

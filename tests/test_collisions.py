@@ -1,0 +1,191 @@
+"""General collisions and forearms: groups as data, touches kept, and the trap of the thesis's figure 4.9."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import motionfit as mf
+from motionfit import samples
+from motionfit._control import Control, Correction, Drive
+from motionfit._fit import block_adjoint, block_solver, block_work, solve_block
+from motionfit._motion import Motion, host_kinematics, rest_motion
+from motionfit.adapt import Group, Sphere, Turn, multi_start
+from motionfit.adapt._collisions import GROUPS, known_depths
+from motionfit.splines import bspline_basis
+from motionfit.terms import Direction, Effort, SkinContact
+from tests.helpers import central_difference, random_motion
+
+RELATIVE = 1e-5  # analytic against central differences in double precision
+
+
+def _as_fit(motion, base, character):
+    return mf.Fit(Correction((), ()), motion, base, "converged", (), mf.Problem(character, base, {}, ()))
+
+
+@pytest.fixture(scope="module")
+def sunk(average):
+    """The walk, and the walk with the left hand swung into the thigh for a moment."""
+    base = mf.onto(samples.walk(cycles=1), average.skeleton)
+    joint = average.skeleton.joint("left_upper_arm")
+    swing = 0.35 * np.exp(-(((np.arange(base.frame_count) - 25) / 8.0) ** 2))
+    world = host_kinematics(base)[1][:, average.skeleton.parents[joint]]
+    # about the forward axis, so that the hanging arm goes to the right
+    axis = Rotation.from_quat(world, scalar_first=True).inv().apply([0.0, 0.0, -1.0])
+    rotations = np.array(base.rotations)
+    own = Rotation.from_quat(rotations[:, joint], scalar_first=True)
+    rotations[:, joint] = (Rotation.from_rotvec(swing[:, None] * axis) * own).as_quat(scalar_first=True)
+    return base, Motion(base.skeleton, base.root, rotations, base.dt)
+
+
+@pytest.mark.slow
+def test_a_hand_comes_out_of_the_thigh(sunk, average):
+    base, bad = sunk
+    turns = (
+        Turn("arm_out", (("left_upper_arm", "forward", 1.0),)),
+        Turn("arm_ahead", (("left_upper_arm", "left", 1.0),)),
+    )
+    group = Group("hand/thigh", ("left_hand",), ("left_thigh",), turns)
+    fit = mf.adapt.collisions(base, average, _as_fit(bad, base, average), groups=(group,))
+    told = fit.details["collisions"]["left_hand/left_thigh"]
+    assert told["excess_before_m"] > 0.02 and told["excess_after_m"] < 0.01
+    # away from the moment nothing moves by much, and the correction alone gives the motion again
+    moved = np.abs(host_kinematics(fit.motion)[0] - host_kinematics(bad)[0]).max(axis=(1, 2))
+    assert moved[-1] < 0.005 < moved[25]
+    np.testing.assert_allclose(fit.correction.apply(fit.base).rotations, fit.motion.rotations, atol=1e-12)
+
+
+def test_a_clip_without_collisions_comes_back(sunk, average):
+    base, _ = sunk
+    group = Group("hand/thigh", ("left_hand",), ("left_thigh",), (Turn("out", (("left_upper_arm", "forward", 1.0),)),))
+    so_far = _as_fit(base, base, average)
+    assert mf.adapt.collisions(base, average, so_far, groups=(group,)).motion is base
+
+
+def test_a_sphere_is_its_centre_deeper_by_its_radius(average):
+    motion = rest_motion(average.skeleton)
+    # near the surface the field is a distance; far away it counts the way to its grid
+    vertex = int(np.flatnonzero(average.part_of_vertex == mf._character.PARTS.index("torso"))[0])
+    small, big = (known_depths(average, (Group("x", (Sphere("hips", radius=r, vertex=vertex),), ("torso",), ()),))
+                  for r in (0.0, 0.03))  # fmt: skip
+    np.testing.assert_allclose(big.depths(motion) - small.depths(motion), 0.03, atol=1e-9)
+
+
+def test_what_is_unknown_is_named(average):
+    walk = samples.walk(cycles=1)[:2]
+    so_far = _as_fit(mf.onto(walk, average.skeleton), mf.onto(walk, average.skeleton), average)
+    with pytest.raises(mf.InputError, match="unknown part 'tail'"):
+        mf.adapt.collisions(walk, average, so_far, groups=(Group("x", ("left_hand",), ("tail",), ()),))
+    with pytest.raises(mf.InputError, match="axes: left, up, forward, bend, swing"):
+        basis = bspline_basis(2, 1 / 60, 0.1)
+        from motionfit.adapt._controls import turn_controls
+
+        turn_controls(so_far.motion, basis, (Turn("x", (("left_hand", "sideways", 1.0),)),))
+
+
+def test_the_tables_name_both_sides_and_all_five_groups():
+    kinds = {g.name.partition("_")[2] for g in GROUPS}
+    assert kinds == {"hand/torso", "hand/head", "hand/shoulder", "hand/legs", "leg/torso"}
+    assert len(GROUPS) == 10
+
+
+def _turned(motion, joint, axis, angle):
+    q = jnp.asarray(motion.rotations)
+    turn = mf.rotation.exp(angle * jnp.asarray(axis))
+    return eqx.tree_at(lambda m: m.rotations, motion, q.at[:, joint].set(mf.rotation.multiply(turn[None], q[:, joint])))
+
+
+def test_direction_is_the_thesis_s_objective_and_has_its_gradient():
+    motion = random_motion(2, 5, 4)
+    target = np.random.default_rng(1).normal(size=(4, 2, 3))
+    target /= np.linalg.norm(target, axis=-1, keepdims=True)
+    term = Direction((1, 2), (3, 4), target, 1.0)
+    kin = mf.forward_kinematics(motion.skeleton, motion)
+    # 4.7, with unit bones
+    printed = -float(jnp.sum(term.directions(kin) * target))
+    np.testing.assert_allclose(0.5 * float(jnp.sum(term.residual(kin) ** 2)) - target[..., 0].size, printed, atol=1e-12)
+
+    @jax.jit
+    def cost(x):
+        return 0.5 * jnp.sum(
+            term.residual(mf.forward_kinematics(motion.skeleton, _turned(motion, 0, [0.6, 0, 0.8], x[0]))) ** 2
+        )
+
+    x = np.array([0.3])
+    np.testing.assert_allclose(jax.grad(cost)(x), central_difference(cost, x), rtol=RELATIVE, atol=1e-8)
+
+
+def test_contact_asks_only_for_what_was_lost(average):
+    motion = mf.onto(samples.walk(cycles=1), average.skeleton)[:3]
+    known = known_depths(average, (Group("x", ("left_hand",), ("left_thigh",), ()),))
+    skin = eqx.tree_at(lambda t: t.allowed, known.clearance.term, (np.zeros((3, 1)),))
+    apart = -known.depths(motion)[:, 0]
+    joint = average.skeleton.joint("left_upper_arm")
+    term = SkinContact(skin, np.array([[1.0], [apart[1] - 0.02], [apart[2] - 0.02]]), np.array([[1.0], [1.0], [0.0]]))
+    rows = np.asarray(eqx.filter_jit(lambda t: t.residual(mf.forward_kinematics(motion.skeleton, motion)))(term))
+    # near enough; 2 cm too far, less half the rounded corner, in units of 1 cm; without weight
+    np.testing.assert_allclose(rows[:, 0], [0.0, 1.9, 0.0], atol=1e-6)
+
+    @jax.jit
+    def cost(x):
+        return 0.5 * jnp.sum(
+            term.residual(mf.forward_kinematics(motion.skeleton, _turned(motion, joint, [0.6, 0, 0.8], x[0]))) ** 2
+        )
+
+    x = np.array([0.01])
+    np.testing.assert_allclose(jax.grad(cost)(x), central_difference(cost, x), rtol=1e-4, atol=1e-6)
+
+
+def test_multi_start_escapes_the_trap_of_figure_4_9():
+    """A straight arm that should point away from the way it bends: the gradient at zero pushes the elbow against its
+    bound, where the solver stays; twisting the shoulder first leads to the minimum."""
+    names = ["hips", "left_upper_arm", "left_forearm", "left_hand"]
+    skeleton = mf.Skeleton(names, [-1, 0, 1, 2], np.array([[0, 0, 0], [0, 0, 0], [0, -0.3, 0], [0, -0.25, 0.0]], float))
+    frames = 8
+    motion = Motion(skeleton, np.zeros((frames, 3)), np.tile([1.0, 0, 0, 0], (frames, 4, 1)), 1 / 60)
+    basis = bspline_basis(frames, 1 / 60, 0.1)
+    controls = (Control("twist", (Drive(1, np.array([0.0, -1.0, 0.0]), 1.0),), basis),
+                Control("bend", (Drive(2, np.array([-1.0, 0.0, 0.0]), 1.0),), basis, 0.0, np.pi / 2))  # fmt: skip
+    away = Rotation.from_rotvec([0.0, -np.deg2rad(120.0), 0.0]) * Rotation.from_rotvec([-1.0, 0.0, 0.0])
+    target = np.tile(away.apply([0.0, -1.0, 0.0]), (frames, 1, 1))
+    terms = {"direction": Direction((2,), (3,), target), "effort": Effort(2.0)}
+    body = eqx.tree_at(lambda c: c.skeleton, mf.load_character("builtin:average"), skeleton)
+    problem = mf.Problem(body, motion, terms, controls)
+    block = mf.Block("forearm", ("twist", "bend"))
+
+    def cost(correction):
+        return sum(problem.costs(correction).values())
+
+    # figure 4.9's surface: from zero, every step of the bend leads uphill
+    zero = Correction.zero(controls)
+    stuck = mf.fit(problem, (block,))
+    assert cost(stuck.correction) > 0.99 * cost(zero)
+    found = multi_start(problem, block)
+    assert cost(found) < 0.5 * cost(zero)
+    # the best within the bounds is a quarter turn of the shoulder, 30 degrees short of the target's plane
+    np.testing.assert_allclose(np.clip(found["twist"], -np.pi / 2, np.pi / 2), np.pi / 2, atol=0.02)
+    # a start of its own ends where the driver does
+    work, solver = block_work(problem, block, tuple(jnp.asarray(p) for p in found.points)), block_solver(problem, block)
+    again = solve_block(work, solver, 20, block_adjoint(solver))
+    assert float(sum(again.after)) <= cost(found) + 1e-6
+
+
+@pytest.mark.slow
+def test_forearms_point_where_they_did(heavy, average):
+    walk = samples.walk(cycles=1)
+    arms = mf.adapt(walk, heavy, reference=average, blocks=("arms",))
+    fit = mf.adapt.forearm(walk, heavy, arms, reference=average, hand=True)
+    before, after = (mf.metrics.forearm_direction(f.motion, arms.base) for f in (arms, fit))
+    assert after < 0.5 * before
+    limit = np.maximum(arms.details["excess_after_m"], 0).max()
+    pairs = tuple(p for p in mf.shape.PAIRS if p.name in arms.details["pairs"])
+    own, _ = mf.adapt.reference_depths(walk, heavy, average, pairs)
+    depths = mf.adapt.volume_depths(mf.adapt.build_clearance(heavy, pairs), fit.motion) - own
+    keep = [k for k, p in enumerate(pairs) if not p.first.endswith("upper_arm")]
+    assert depths[:, keep].max() <= max(limit, 0.01)
+    assert mf.metrics.derivative_ratio(fit.motion, arms.base, 3) <= 1.05
+    hands = [heavy.skeleton.joint(f"{s}_hand") for s in ("left", "right")]
+    turned = [host_kinematics(m)[1][:, hands] for m in (arms.base, fit.motion)]
+    np.testing.assert_allclose(np.abs((turned[0] * turned[1]).sum(-1)), 1.0, atol=1e-9)
