@@ -29,14 +29,16 @@ SIGMA = 0.001  # [m] of slide in a frame, and of height, that costs one half in 
 
 
 def footskate(
-    clip: Motion, character: Character, so_far: Fit, *, reference: Character | None = None, legs: bool = False
-) -> Fit:
+    clip: Motion, character: Character, so_far: Fit, *, reference: Character | None = None, drift: bool = True,
+    legs: bool = False,
+) -> Fit:  # fmt: skip
     """The fit so far with a root path on which no planted foot skates; every rotation is the very same array.
 
-    The feet are planted where they are in the source, `so_far.base`. What the blocks before did to a carrying foot's path
-    and to the height of the lower foot is taken back; then the drift of the carrying foot is taken out, until
-    none drifts by more than a centimetre in a stance. A clip in which none does, and whose legs no block turned, comes
-    back as it was. Tremor stays: `motionfit.remove_footskate` holds a foot in every frame, at the price of jerk.
+    The feet are planted where they are in the source, `so_far.base`. What the blocks before did to a carrying foot's
+    path and to the height of the lower foot is taken back. With `drift` the drift of the carrying foot is taken out
+    too, until none drifts by more than a centimetre in a stance; without it, what the source drifts is left. A clip
+    whose feet do neither comes back as it was. Tremor stays: `motionfit.remove_footskate` holds a foot in every frame,
+    at the price of jerk.
 
     With `legs` the legs take back what the blocks before did to the feet, both at once, instead of the root: it does
     not sway, and the zero-moment point stays near the support, but thighs and shanks turn by a degree or two away from
@@ -61,6 +63,9 @@ def footskate(
     for rounds in range(ROUNDS + 1):
         shift[:, 1] = 0.0
         shift[:, 1] = rise + plants.floor.at(shift) - plants.floor.height  # a floor may be tilted
+        more = np.zeros_like(shift)
+        if not drift:
+            break
         # what drifts is judged by the plants that the result itself shows: so it stays as it is when adapted again
         same = motion is so_far.base and not shift.any()
         seen, found = (plants, evidence) if same else detect(sole, _moved(motion, shift))

@@ -41,7 +41,8 @@ def adapt(
     The clip is put on the character (`motionfit.onto`), then the blocks run in the order of thesis 5.2: `arms` keeps
     upper arms, forearms and hands out of the trunk and the thighs, the left arm first, `legs` the thighs and calves
     apart; `forearm` brings the forearms back to where they pointed; `collisions` takes hands out of head, other arm
-    and legs, and keeps touches that were meant; `footskate` keeps the planted feet where they are, by the root alone;
+    and legs, and keeps touches that were meant; `footskate` keeps the planted feet where they are, by the root alone
+    (without other blocks, it also stops what drift the source has itself);
     `balance` keeps the zero-moment point as near to the support as it was. Each has options of its own as
     `motionfit.adapt.forearm` and so on, which go on from a `Fit`. Penetration counts as far as it exceeds what the same
     clip shows on `reference`, the body that it was made for; without one, on the character before `girth`, else in
@@ -70,8 +71,10 @@ def adapt(
                     start=start, progress=functools.partial(told, 0))  # fmt: skip
     else:
         fit = Fit(Correction((), ()), base, base, "converged", (), Problem(character, base, {}, ()))
+    # what the source drifts is its own, unless nothing else is asked for
+    options = {"footskate": {"drift": tuple(blocks) == ("footskate",)}}
     for k, name in enumerate(later, start=bool(first)):
-        fit = LATER[name](clip, character, fit, reference=reference)
+        fit = LATER[name](clip, character, fit, reference=reference, **options.get(name, {}))
         told(k, name, 1, 1)
     return fit
 
