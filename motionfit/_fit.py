@@ -1,9 +1,11 @@
 """Block-coordinate descent over optimistix solvers, and nothing else: thesis 4.3.1."""
 
 import dataclasses
+import functools
 import json
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import equinox as eqx
@@ -143,6 +145,7 @@ class _Rows(eqx.Module):
     free: Int[Array, " free"]
     terms: tuple[int, ...] = eqx.field(static=True)
 
+    @eqx.filter_jit  # traced once, however often a solver's program evaluates it
     def __call__(self, signals: Float[Array, "frames free"]) -> Float[Array, "frames n"]:
         kin = self.objective.kinematics(self.fixed.at[:, self.free].set(signals))
         frames = signals.shape[0]
@@ -287,7 +290,7 @@ def check_reach(problem: Problem, block: Block, work: Work) -> None:
 
 def fit(
     problem: Problem,
-    blocks: Sequence[Block],
+    blocks: Sequence[Block | tuple[Block, ...]],
     sweeps: int = 1,
     *,
     correction: Correction | None = None,
@@ -295,34 +298,56 @@ def fit(
 ) -> Fit:
     """Block-coordinate descent: solve each block in turn over its free controls, `sweeps` times.
 
+    Blocks in a tuple are solved side by side, each from where all of them started: for blocks that free different
+    controls, and do not look at each other's.
+
     Starts at `correction` (None: zero). `progress(block name, done, total)` is called after each block. Never
     raises for a hard clip: the best iterate comes back, and `history` says what moved.
     """
-    blocks = tuple(blocks)
+    groups = [group if isinstance(group, tuple) else (group,) for group in blocks]
     names = [c.name for c in problem.controls]
-    for block in blocks:
-        _check(block, problem, names)
+    for group in groups:
+        free = [c for block in group for c in block.controls]
+        if len(set(free)) < len(free):
+            raise InputError(f"blocks {', '.join(b.name for b in group)} cannot be solved side by side: they free the "
+                             "same control; give them one after the other")  # fmt: skip
+        for block in group:
+            _check(block, problem, names)
     points = tuple(jnp.asarray(p, float) for p in (correction or Correction.zero(problem.controls)).points)
     history: list[BlockReport] = []
+    total, done = sweeps * sum(len(group) for group in groups), 0
     for sweep in range(sweeps):
-        for i, block in enumerate(blocks):
-            started = time.perf_counter()
-            terms = tuple(problem.terms) if block.terms is None else block.terms
-            work = block_work(problem, block, points)
-            if sweep == 0:
-                check_reach(problem, block, work)
-            solver = block_solver(problem, block)
-            solved = _solve(work, solver, block.max_steps, block_adjoint(solver))
-            points, report = settle(block, terms, points, work, jax.device_get(solved), sweep)
-            history.append(dataclasses.replace(report, time_s=time.perf_counter() - started))
-            if progress is not None:
-                progress(block.name, sweep * len(blocks) + i + 1, sweeps * len(blocks))
+        for group in groups:
+            run = functools.partial(_run, problem, points, sweep == 0)
+            if len(group) == 1:
+                runs = [run(group[0])]
+            else:
+                with ThreadPoolExecutor(len(group)) as pool:
+                    runs = list(pool.map(run, group))
+            for block, (work, solved, time_s) in zip(group, runs, strict=True):
+                terms = tuple(problem.terms) if block.terms is None else block.terms
+                points, report = settle(block, terms, points, work, solved, sweep)
+                history.append(dataclasses.replace(report, time_s=time_s))
+                done += 1
+                if progress is not None:
+                    progress(block.name, done, total)
     result = Correction(problem.controls, points)
     last = {b.name: b.status for b in history}
     status = "no_progress" if "no_progress" in last.values() else "converged"
     if status == "converged" and "max_steps" in last.values():
         status = "violations_left"
     return Fit(result, result.apply(problem.motion), problem.motion, status, tuple(history), problem)
+
+
+def _run(problem: Problem, points: tuple[Array, ...], check: bool, block: Block) -> tuple[Work, Solved, float]:
+    """Solve one block; with the seconds that it took."""
+    started = time.perf_counter()
+    work = block_work(problem, block, points)
+    if check:
+        check_reach(problem, block, work)
+    solver = block_solver(problem, block)
+    solved = jax.device_get(_solve(work, solver, block.max_steps, block_adjoint(solver)))
+    return work, solved, time.perf_counter() - started
 
 
 def block_work(problem: Problem, block: Block, points: tuple[Array, ...]) -> Work:

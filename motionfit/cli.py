@@ -290,9 +290,9 @@ def _measure_all(body, motions: dict, source, clip, reference, progress) -> dict
     pairs = mf.shape.PAIRS
     clearance = build_clearance(body, pairs)
     limit, _ = reference_depths(clip, body, reference, pairs)
-    # about 30 looks per second at the skin: what a limb does between two of them is under a millimetre deep
+    # about 15 looks per second at the skin, between which a limb sinks in or out by some millimetres
     some = next(iter(motions.values()))
-    step = max(1, round(some.frame_rate / 30))
+    step = max(1, round(some.frame_rate / 15))
     own = original = None
     if reference is not None:
         original = mf.onto(clip, reference.skeleton)

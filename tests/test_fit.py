@@ -138,3 +138,21 @@ def test_corrections_save_and_apply_to_the_same_bits(still, tmp_path):
         again["nose"]
     with pytest.raises(mf.InputError, match="20 frames"):
         again.apply(motion[:5])
+
+
+def test_blocks_side_by_side_are_those_one_after_the_other(still):
+    character, motion = still
+    roles = ("left_upper_arm", "right_upper_arm")
+    controls = tuple(_control(character, motion, role) for role in roles)
+    terms = {r: mf.Custom(lambda kin, goal, k=k: (kin.signals[:, k] - goal) / 0.1, 0.1 + k, reach=0)
+             for k, r in enumerate(roles)}  # fmt: skip
+    problem = mf.Problem(character, motion, terms, controls)
+    left, right = (mf.Block(role, (role,), (role,)) for role in roles)
+    done: list[tuple[str, int, int]] = []
+    together = mf.fit(problem, ((left, right),), progress=lambda *x: done.append(x))
+    alone = mf.fit(problem, (left, right))
+    for a, b in zip(together.correction.points, alone.correction.points, strict=True):
+        assert np.array_equal(a, b)
+    assert done == [("left_upper_arm", 1, 2), ("right_upper_arm", 2, 2)]
+    with pytest.raises(mf.InputError, match="side by side"):
+        mf.fit(problem, ((left, mf.Block("again", ("left_upper_arm",))),))

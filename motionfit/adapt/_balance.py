@@ -33,6 +33,7 @@ from motionfit.terms.balance import Standing, ZmpMargin
 from motionfit.terms.pose import Effort, Smoothness
 
 ALLOWED_EXCESS = 0.005  # [m] beyond its threshold that a frame may keep: what the filter's choice alone makes
+LEFT_ALONE = 0.03  # [m] the same, of a clip whose mean is no farther than the source's
 MEAN_ENOUGH = 0.0005  # [m] of mean distance more than the source's, what may be left
 MOST_LEFT = 0.001  # [m] the same, before it counts as a violation
 CARTOON = 0.9  # thesis 4.7.3: thresholds scaled by less lean the character more than one would
@@ -91,7 +92,7 @@ def balance(
         return dataclasses.replace(result, details={**so_far.details, "balance": told})
 
     excess = np.where(before.supported, np.asarray(before.outside) - scale * threshold, 0.0)
-    if excess.max(initial=0.0) <= 2 * ALLOWED_EXCESS and _mean(before) <= wanted + MEAN_ENOUGH:
+    if excess.max(initial=0.0) <= LEFT_ALONE and _mean(before) <= wanted + MEAN_ENOUGH:
         return done(so_far, before)
 
     controls = lean_controls(character, motion, at.whole, gaze)

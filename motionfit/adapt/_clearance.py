@@ -11,7 +11,7 @@ from jax import Array
 from jaxtyping import Float
 
 from motionfit._character import PARTS, Character
-from motionfit._motion import Kinematics, Motion, bucket, forward_kinematics, padded
+from motionfit._motion import Kinematics, Motion, forward_kinematics
 from motionfit._skeleton import SIDES
 from motionfit._types import InputError
 from motionfit.shape.field import (
@@ -157,28 +157,29 @@ def _joint(character: Character, pairs: tuple[Pair, ...]) -> Clearance:
 
 # --- looking at a motion ----------------------------------------------------------------------------------------
 
-CHUNK = 1024  # frames looked at at once: what bounds the memory of long clips
+CHUNK = 64  # frames looked at at once: one program whatever the clip's length, and bounded memory
+
+
+def over_time(look, term: Term, motion: Motion, allowed: Float[np.ndarray, "frames rows"] | None = None) -> list:
+    """`look(term, kinematics, allowed)` of chunk after chunk; the last frame is repeated to fill the last chunk."""
+    frames = motion.frame_count
+    order = np.minimum(np.arange(-(-frames // CHUNK) * CHUNK), frames - 1).reshape(-1, CHUNK)
+    return [_look(look, term, motion[some], None if allowed is None else allowed[some]) for some in order]
 
 
 @eqx.filter_jit
-def over_time(look, term: Term, motion: Motion, allowed: Float[Array, "frames rows"] | None):
-    """`look(term, kinematics, allowed)` chunk after chunk of frames."""
-    frames = motion.root.shape[0]
-    pieces = -(-frames // CHUNK)
-    size = -(-frames // pieces)
-    order = jnp.minimum(jnp.arange(pieces * size), frames - 1).reshape(pieces, size)
-
-    def at(some):
-        part = jax.tree.map(
-            lambda x: jnp.asarray(x)[some], (motion.root, motion.rotations, motion.translations, allowed)
-        )
-        chunk = Motion(motion.skeleton, part[0], part[1], motion.dt, part[2])
-        return look(term, forward_kinematics(motion.skeleton, chunk), part[3])
-
-    return jax.lax.map(at, order)
+def _look(look, term: Term, motion: Motion, allowed: Float[Array, "frames rows"] | None):
+    return look(term, forward_kinematics(motion.skeleton, motion), allowed)
 
 
-def row_depths(term: Term, kin: Kinematics, allowed) -> Float[Array, "frames rows"]:
+def all_rows(term: Term, motion: Motion) -> Float[np.ndarray, "frames rows"]:
+    """Depth [m] of every row of a term in every frame; negative where there is a gap."""
+    return np.concatenate([np.asarray(rows, float) for rows in over_time(_row_depths, term, motion)])[
+        : motion.frame_count
+    ]
+
+
+def _row_depths(term: Term, kin: Kinematics, allowed) -> Float[Array, "frames rows"]:
     del allowed
     if isinstance(term, JointClearance):
         return jnp.asarray(term.min_distance) - term.distance(kin)
@@ -197,9 +198,7 @@ def _support(term: SkinClearance, kin: Kinematics, allowed) -> Float[Array, "set
 
 def volume_depths(clearance: Clearance, motion: Motion) -> Float[np.ndarray, "frames pairs"]:
     """Depth [m] of every pair in every frame on the volumes, 0 where they are apart."""
-    frames = motion.frame_count
-    rows = np.asarray(over_time(row_depths, clearance.term, padded(motion, bucket(frames)), None), float)
-    rows = rows.reshape(-1, rows.shape[-1])[:frames]
+    rows = all_rows(clearance.term, motion)
     owner = np.array(clearance.pair_of_row)
     depth = np.stack([rows[:, owner == k].max(axis=1) for k in range(len(clearance.pairs))], axis=1)
     return np.maximum(depth, 0.0)
@@ -209,10 +208,8 @@ def support(
     clearance: Clearance, motion: Motion, allowed: Float[np.ndarray, "frames pairs"]
 ) -> Float[np.ndarray, "sets points"]:
     """How much each probe has to do with the depth of its pair over the clip: what `reduced` goes by."""
-    frames = bucket(motion.frame_count)
-    rows = allowed[:, list(clearance.pair_of_row)]
-    rows = jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], frames - len(rows), axis=0)]), float)
-    return np.asarray(over_time(_support, clearance.term, padded(motion, frames), rows)).sum(axis=0)
+    rows = np.asarray(allowed[:, list(clearance.pair_of_row)], float)
+    return np.sum([np.asarray(x) for x in over_time(_support, clearance.term, motion, rows)], axis=0)
 
 
 def reduced(

@@ -15,12 +15,12 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from motionfit._character import PARTS, Character
 from motionfit._control import Correction
 from motionfit._fit import Block, Fit, fit
-from motionfit._motion import Motion, bind_pose, bucket, padded
+from motionfit._motion import Motion, bind_pose
 from motionfit._onto import onto
 from motionfit._problem import During, Problem, Robust
 from motionfit._skeleton import SIDES
 from motionfit._types import InputError
-from motionfit.adapt._clearance import Clearance, counted_probes, kept_with, over_time, reduced, row_depths, support
+from motionfit.adapt._clearance import Clearance, all_rows, counted_probes, kept_with, reduced, support
 from motionfit.adapt._controls import Turn, turn_controls
 from motionfit.adapt._limbs import jerk_scale, smooth_floor
 from motionfit.adapt._record import recorded
@@ -113,9 +113,7 @@ class Known(NamedTuple):
 
     def depths(self, motion: Motion) -> Float[np.ndarray, "frames rows"]:
         """Depth [m] of each row in each frame; negative where there is a gap."""
-        frames = motion.frame_count
-        rows = np.asarray(over_time(row_depths, self.clearance.term, padded(motion, bucket(frames)), None), float)
-        return rows.reshape(-1, rows.shape[-1])[:frames] + self.radius
+        return all_rows(self.clearance.term, motion) + self.radius
 
 
 def collisions(

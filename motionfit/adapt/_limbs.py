@@ -145,7 +145,7 @@ def limbs(
 
     for round_ in range(ROUNDS):
         problem = _problem(character, seen, stages, beyond, smooth, (small, moved))
-        result = fit(problem, [s.block for s in stages], sweeps, correction=correction, progress=told(round_))
+        result = fit(problem, _side_by_side(stages), sweeps, correction=correction, progress=told(round_))
         correction, history = result.correction, [*history, *result.history]
         moved = result.motion[np.arange(small.frame_count)]
         used = allowed if not round_ else np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
@@ -197,6 +197,13 @@ def _check_start(start: Fit, seen: Seen, pairs: tuple[Pair, ...]) -> None:
 
 def _filled(points, count: int) -> Float[np.ndarray, " count"]:
     return np.concatenate([np.asarray(points, float), np.zeros(count - len(points))])
+
+
+def _side_by_side(stages: list[Stage]) -> list[Block | tuple[Block, ...]]:
+    """The legs do not look at the arms, so they go with the first one. The other arm shares its program, and waits."""
+    blocks = [s.block for s in stages]
+    legs = tuple(b for b in blocks if b.name == "legs")
+    return blocks if len(blocks) == 1 or not legs else [(blocks[0], *legs), *(b for b in blocks[1:] if b not in legs)]
 
 
 def _amount(over: Float[np.ndarray, "frames pairs"]) -> float:
