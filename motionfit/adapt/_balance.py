@@ -33,7 +33,6 @@ from motionfit.terms.balance import Standing, ZmpMargin
 from motionfit.terms.pose import Effort, Smoothness
 
 ALLOWED_EXCESS = 0.005  # [m] beyond its threshold that a frame may keep: what the filter's choice alone makes
-LEFT_ALONE = 0.03  # [m] the same, of a clip whose mean is no farther than the source's
 MEAN_ENOUGH = 0.0005  # [m] of mean distance more than the source's, what may be left
 MOST_LEFT = 0.001  # [m] the same, before it counts as a violation
 CARTOON = 0.9  # thesis 4.7.3: thresholds scaled by less lean the character more than one would
@@ -66,8 +65,8 @@ def balance(
     Without a reference the thresholds are those of the clip before any correction on the character itself. `scale`
     multiplies them: below 0.9 it looks like a cartoon. `gaze` keeps the head's orientation.
 
-    A clip that is balanced enough comes back as it was. `details["balance"]` holds the mean distance [m] of the source,
-    and before and after; the root's way lies in the fit's `base`.
+    A clip that is as balanced in the mean comes back as it was. `details["balance"]` holds the mean distance [m] of
+    the source, and before and after; the root's way lies in the fit's `base`.
     """
     if not 0.0 <= scale <= 2.0:
         raise InputError(f"thresholds can be scaled by 0 to 2, got {scale:g}")
@@ -91,8 +90,7 @@ def balance(
                 "zmp_distance_after_m": _mean(after), "supported_frames": int(np.asarray(after.supported).sum())}  # fmt: skip
         return dataclasses.replace(result, details={**so_far.details, "balance": told})
 
-    excess = np.where(before.supported, np.asarray(before.outside) - scale * threshold, 0.0)
-    if excess.max(initial=0.0) <= LEFT_ALONE and _mean(before) <= wanted + MEAN_ENOUGH:
+    if _mean(before) <= wanted + MEAN_ENOUGH:
         return done(so_far, before)
 
     controls = lean_controls(character, motion, at.whole, gaze)
