@@ -174,12 +174,12 @@ def _look(look, term: Term, motion: Motion, allowed: Float[Array, "frames rows"]
 
 def all_rows(term: Term, motion: Motion) -> Float[np.ndarray, "frames rows"]:
     """Depth [m] of every row of a term in every frame; negative where there is a gap."""
-    return np.concatenate([np.asarray(rows, float) for rows in over_time(_row_depths, term, motion)])[
+    return np.concatenate([np.asarray(rows, float) for rows in over_time(row_depths, term, motion)])[
         : motion.frame_count
     ]
 
 
-def _row_depths(term: Term, kin: Kinematics, allowed) -> Float[Array, "frames rows"]:
+def row_depths(term: Term, kin: Kinematics, allowed) -> Float[Array, "frames rows"]:
     del allowed
     if isinstance(term, JointClearance):
         return jnp.asarray(term.min_distance) - term.distance(kin)
