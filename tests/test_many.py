@@ -49,3 +49,11 @@ def test_a_start_of_another_clip_is_refused(walk, average):
         mf.adapt(walk[:20], average, reference=average, start=fit, **ARMS)
     with pytest.raises(mf.InputError, match="other blocks"):
         mf.adapt(walk, average, reference=average, start=fit, blocks=("legs",))
+
+
+def test_a_start_may_hold_controls_of_later_blocks(walk, heavy, average):
+    bodies = [heavy, mf.shape.grow(heavy, {"trunk": 1.02})]
+    first, second = mf.adapt_many(walk, bodies, reference=average, workers=1)
+    # the block adds controls where it has something to do, as it has on a heavy body
+    assert first.details["balance"]["zmp_distance_before_m"] > first.details["balance"]["zmp_distance_after_m"]
+    assert len(first.correction.controls) > 8 and second.status == "converged"

@@ -132,7 +132,9 @@ def limbs(
 
     stages = _stages(character, blocks, pairs, objective, allowed, quiet)
     smooth, history, moved = jerk_scale(base), [], small
-    points = Correction.zero(seen.controls).points if start is None else start.correction.points
+    # by name: later blocks may have added controls of their own
+    points = (Correction.zero(seen.controls).points if start is None
+              else [start.correction[c.name] for c in seen.controls])  # fmt: skip
     # a whole clip has no more control points than the bucket that the solver sees
     correction = Correction(seen.controls, tuple(_filled(p, seen.basis.count) for p in points))
     best, since = Iterate((np.inf,), correction, None, before, beyond, np.inf), 0
@@ -188,9 +190,9 @@ def limbs(
 
 
 def _check_start(start: Fit, seen: Seen, pairs: tuple[Pair, ...]) -> None:
-    had = start.details.get("pairs"), [c.name for c in start.correction.controls]
-    wanted = [p.name for p in pairs], [c.name for c in seen.controls]
-    if had != wanted or len(start.details["frames"]) != len(seen.frames):
+    had, controls = start.details.get("pairs"), {c.name for c in start.correction.controls}
+    same = had == [p.name for p in pairs] and controls >= {c.name for c in seen.controls}
+    if not same or len(start.details["frames"]) != len(seen.frames):
         raise InputError("start= is a fit of another clip, other blocks or another objective; give one of the same clip "
                          "and blocks, or leave it out")  # fmt: skip
 
