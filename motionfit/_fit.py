@@ -109,7 +109,7 @@ def levenberg_marquardt(
 
 
 @eqx.filter_custom_jvp
-def _frame_local_rows(signals: Float[Array, "frames controls"], rows: Callable) -> Array:
+def _frame_local_rows(signals: Float[Array, "frames controls"], rows: Callable) -> tuple[Array, ...]:
     """Rows (frames, n) of terms that look at one frame at a time, with a cheap Jacobian in the control points.
 
     Row t depends on the signals of frame t only, so d row_t / d signal_c for *all* t comes from one product with
@@ -127,18 +127,18 @@ def _frame_local_rows_jvp(primals, tangents):
         seeds = jnp.eye(signals.shape[1], dtype=signals.dtype)[:, None, :] * jnp.ones_like(signals)
         product = jax.vmap(lambda seed: jax.jvp(rows, (signals,), (seed,)), out_axes=(None, 0))
         value, columns = product(seeds)
-        tangent = jnp.einsum("tc,ctn->tn", t_signals, columns)
+        tangent = jax.tree.map(lambda c: jnp.einsum("tc,ctn->tn", t_signals, c), columns)
     else:
         value = rows(signals)
-        tangent = jnp.zeros_like(value)
+        tangent = jax.tree.map(jnp.zeros_like, value)
     if any(leaf is not None for leaf in jax.tree.leaves(t_rows)):
         _, extra = eqx.filter_jvp(lambda r: r(signals), (rows,), (t_rows,))
-        tangent = tangent + extra
+        tangent = jax.tree.map(jnp.add, tangent, extra)
     return value, tangent
 
 
 class _Rows(eqx.Module):
-    """The weighted residuals of some terms as a function of the signals of the free controls."""
+    """The weighted residuals of some terms, (frames, n) each, as a function of the signals of the free controls."""
 
     objective: Objective
     fixed: Float[Array, "frames controls"]  # signals of all controls; the free columns are replaced
@@ -146,14 +146,58 @@ class _Rows(eqx.Module):
     terms: tuple[int, ...] = eqx.field(static=True)
 
     @eqx.filter_jit  # traced once, however often a solver's program evaluates it
-    def __call__(self, signals: Float[Array, "frames free"]) -> Float[Array, "frames n"]:
+    def __call__(self, signals: Float[Array, "frames free"]) -> tuple[Float[Array, "frames _"], ...]:
         kin = self.objective.kinematics(self.fixed.at[:, self.free].set(signals))
-        frames = signals.shape[0]
-        rows = [
-            jnp.sqrt(self.objective.weights[k]) * self.objective.terms[k].residual(kin).reshape(frames, -1)  # type: ignore
+        return tuple(
+            jnp.sqrt(self.objective.weights[k])
+            * self.objective.terms[k].residual(kin).reshape(signals.shape[0], -1)  # type: ignore
             for k in self.terms
-        ]
-        return jnp.concatenate(rows, axis=1) if rows else jnp.zeros((frames, 0), signals.dtype)
+        )
+
+
+class _Remembers(eqx.Module):
+    """An optimistix solver that also tells what its function said at the start, as `solution.stats["start"]`: the
+    first step of each is there. To ask the function once more would compile it once more."""
+
+    inner: optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
+
+    @property
+    def rtol(self):
+        return self.inner.rtol
+
+    @property
+    def atol(self):
+        return self.inner.atol
+
+    @property
+    def norm(self):
+        return self.inner.norm
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        start = jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), aux_struct)
+        return self.inner.init(fn, y, args, options, f_struct, aux_struct, tags), jnp.array(True), start
+
+    def step(self, fn, y, args, options, state, tags):
+        inner, first, start = state
+        y, inner, aux = self.inner.step(fn, y, args, options, inner, tags)
+        start = jax.tree.map(lambda old, new: jnp.where(first, new, old), start, aux)
+        return y, (inner, jnp.array(False), start), aux
+
+    def terminate(self, fn, y, args, options, state, tags):
+        return self.inner.terminate(fn, y, args, options, state[0], tags)
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        y, aux, stats = self.inner.postprocess(fn, y, aux, args, options, state[0], tags, result)
+        accepted = getattr(state[0], "num_accepted_steps", None)
+        return y, aux, {**stats, "start": state[2], **({} if accepted is None else {"accepted": accepted})}
+
+
+class _RemembersSquares(_Remembers, optx.AbstractLeastSquaresSolver):
+    pass
+
+
+class _RemembersMinimum(_Remembers, optx.AbstractMinimiser):
+    pass
 
 
 class Work(NamedTuple):
@@ -176,38 +220,38 @@ class Solved(NamedTuple):
 
 def solve_block(work: Work, solver, max_steps: int, adjoint: optx.AbstractAdjoint) -> Solved:
     """Run one block's solver; a pure function of arrays, to be jitted, vmapped or differentiated."""
-    objective = work.objective
-    fixed = objective.signals(work.points)
-    start = work.start
-    terms = range(len(objective.terms))
-    least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
+    terms = range(len(work.objective.terms))
+    local = tuple(k for k in terms if work.objective.terms[k].reach == 0)
+    other = tuple(k for k in terms if k not in local)
 
     def signals_of(x, controls):
         return jnp.stack([c.signal(p) for c, p in zip(controls, x, strict=True)], axis=1)
 
+    def joined(rows, frames):
+        return jnp.concatenate(rows, axis=1) if rows else jnp.zeros((frames, 0))
+
     def residuals(x, args):
         objective, controls, free, fixed = args
         signals = signals_of(x, controls)
-        local = tuple(k for k in terms if objective.terms[k].reach == 0)
-        other = tuple(k for k in terms if objective.terms[k].reach != 0)
-        return (_frame_local_rows(signals, _Rows(objective, fixed, free, local)),
+        rows = (_frame_local_rows(signals, _Rows(objective, fixed, free, local)),
                 _Rows(objective, fixed, free, other)(signals))  # fmt: skip
+        costs = {k: 0.5 * jnp.sum(jnp.square(r)) for k, r in zip(local + other, rows[0] + rows[1], strict=True)}
+        return tuple(joined(r, len(signals)) for r in rows), tuple(costs[k] for k in terms)
 
-    def costs(x, args):
+    def energy(x, args):
         objective, controls, free, fixed = args
         kin = objective.kinematics(fixed.at[:, free].set(signals_of(x, controls)))
-        return tuple(w * term_cost(t, kin) for t, w in zip(objective.terms, objective.weights, strict=True))
+        costs = tuple(w * term_cost(t, kin) for t, w in zip(objective.terms, objective.weights, strict=True))
+        return sum(costs), costs
 
-    arguments = (objective, work.controls, jnp.asarray(work.free), fixed)
-    options = {"max_steps": max_steps, "throw": False, "adjoint": adjoint}
-    if least_squares:
-        solution = optx.least_squares(residuals, solver, start, arguments, **options)
+    arguments = (work.objective, work.controls, jnp.asarray(work.free), work.objective.signals(work.points))
+    options = {"max_steps": max_steps, "throw": False, "adjoint": adjoint, "has_aux": True}
+    if isinstance(solver, optx.AbstractLeastSquaresSolver):
+        solution = optx.least_squares(residuals, _RemembersSquares(solver), work.start, arguments, **options)
     else:
-        solution = optx.minimise(lambda x, args: sum(costs(x, args)), solver, start, arguments, **options)
-    both = jax.tree.map(lambda a, b: jnp.stack([a, b]), start, solution.value)
-    before_after = jax.lax.map(lambda x: costs(x, arguments), both)
-    steps = getattr(solution.state, "num_accepted_steps", solution.stats["num_steps"])
-    return Solved(solution.value, tuple(c[0] for c in before_after), tuple(c[1] for c in before_after), steps,
+        solution = optx.minimise(energy, _RemembersMinimum(solver), work.start, arguments, **options)
+    return Solved(solution.value, solution.stats["start"], solution.aux,
+                  solution.stats.get("accepted", solution.stats["num_steps"]),
                   solution.result == optx.RESULTS.successful)  # fmt: skip
 
 
@@ -257,7 +301,7 @@ def _reach_errors(work: Work, reaches: tuple[int, ...], solver: Banded) -> tuple
 
         def rows(x, k=k):
             signals = jnp.stack([c.signal(p) for c, p in zip(work.controls, x, strict=True)], axis=1)
-            return _Rows(objective, fixed, work.free, (k,))(signals)
+            return _Rows(objective, fixed, work.free, (k,))(signals)[0]
 
         value, product = jax.linearize(rows, start)
         operator = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: start))

@@ -1,8 +1,10 @@
 """Forward kinematics against 4x4 products, skinning against rigid bodies."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import trimesh
 from hypothesis import given
 from scipy.spatial.transform import Rotation
@@ -42,6 +44,46 @@ def test_translations_replace_the_offsets():
     moving = mf.Motion(motion.skeleton, motion.root, motion.rotations, motion.dt, offsets)
     a, b = (mf.forward_kinematics(m.skeleton, m).positions_world for m in (motion, moving))
     np.testing.assert_allclose(a, b, atol=EXACT)
+
+
+@pytest.mark.parametrize(("seed", "joints", "frames"), [(0, 1, 1), (1, 2, 3), (2, 9, 2)])
+def test_derivatives_in_closed_form_agree_with_differences(seed, joints, frames):
+    """Of everything that a tree is made of, quaternions that leave the sphere too; and the derivative's own derivative,
+    and the gradient as its transpose."""
+    motion = random_motion(seed, joints, frames)
+    rng, skeleton = np.random.default_rng(seed), motion.skeleton
+    moving = np.tile(np.asarray(skeleton.offsets), (frames, 1, 1))
+    start = tuple(jnp.asarray(x) for x in (motion.root, motion.rotations, moving, skeleton.offsets))
+    ways = tuple(jnp.asarray(rng.normal(size=x.shape)) for x in start)
+
+    def kinematics(root, rotations, translations, offsets):
+        body = eqx.tree_at(lambda s: s.offsets, skeleton, offsets)
+        kin = mf.forward_kinematics(body, mf.Motion(body, root, rotations, motion.dt, translations))
+        return kin.positions_world, kin.rotations_world, kin.positions_bind
+
+    def along(step):
+        return kinematics(*(x + step * way for x, way in zip(start, ways, strict=True)))
+
+    def velocity(step):
+        return jax.jvp(along, (step,), (1.0,))[1]
+
+    h = 1e-5
+    for fn, derivative in ((along, velocity), (velocity, lambda step: jax.jvp(velocity, (step,), (1.0,))[1])):
+        if fn is velocity:  # off the sphere a second derivative is not that of a rotation
+            ways = (ways[0], _tangential(ways[1], start[1]), *ways[2:])
+        oracle = jax.tree.map(lambda a, b: (a - b) / (2 * h), fn(h), fn(-h))
+        for told, expected in zip(derivative(0.0), oracle, strict=True):
+            np.testing.assert_allclose(told, expected, atol=1e-6 * float(1 + jnp.abs(expected).max()))
+
+    weights = tuple(jnp.asarray(rng.normal(size=x.shape)) for x in along(0.0))
+    _, pull = jax.vjp(kinematics, *start)
+    there = sum(jnp.vdot(w, v) for w, v in zip(weights, velocity(0.0), strict=True))
+    back = sum(jnp.vdot(g, way) for g, way in zip(pull(weights), ways, strict=True))
+    np.testing.assert_allclose(there, back, rtol=1e-9)
+
+
+def _tangential(ways, quaternions):
+    return ways - jnp.sum(ways * quaternions, axis=-1, keepdims=True) * quaternions
 
 
 def test_skinning_moves_rigid_parts_as_trimesh_does():

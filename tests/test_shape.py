@@ -89,7 +89,7 @@ def test_a_field_tells_the_depth_below_the_skin(heavy):
         corners = vertices[surface.triangles[rng.integers(0, len(surface.triangles), 400)]].mean(axis=1)
         points = corners + rng.normal(size=(400, 3)) * 0.02
         exact = inside_depths(points, vertices, surface.triangles)
-        told = np.asarray(field.depth(kin, jnp.asarray(points.T)[:, None]))[0]
+        told = np.asarray(field.depth(kin, points.T[None]))[0]
         inside = exact > 0.004
         assert np.median(np.abs(told[inside] - exact[inside])) < 0.0015, part
         assert np.mean(told[exact == 0] < 0.004) > 0.95, part
@@ -104,7 +104,7 @@ def test_a_field_moves_with_its_part(heavy, rng):
     rotations[0, 0] = (turn * Rotation.from_quat(rotations[0, 0], scalar_first=True)).as_quat(scalar_first=True)
     moved = mf.Motion(heavy.skeleton, turn.apply(np.asarray(still.root)) + shift, rotations, still.dt)
     depths = [
-        field.depth(mf.forward_kinematics(heavy.skeleton, m), jnp.asarray(p.T)[:, None])
+        field.depth(mf.forward_kinematics(heavy.skeleton, m), p.T[None])
         for m, p in ((still, points), (moved, turn.apply(points) + shift))
     ]
     np.testing.assert_allclose(*depths, atol=1e-9)
@@ -116,13 +116,13 @@ def test_lookups_have_the_gradient_that_differences_show(heavy, rng):
     points = np.asarray(field.origin) + rng.uniform(0.5, size - 1.5, size=(40, 3)) * np.asarray(field.spacing)
 
     def total(x):
-        return jnp.sum(jnp.sin(50 * field.depth_home(list(x.T))))
+        return jnp.sum(jnp.sin(50 * field.depth_home(x.T)))
 
     gradient = jax.grad(total)(jnp.asarray(points))
     np.testing.assert_allclose(gradient, central_difference(jax.jit(total), points), atol=1e-5)
     tables = jnp.asarray(field.coefficients)
     along = jax.jvp(
-        lambda c: eqx.tree_at(lambda f: f.coefficients, field, c).depth_home(list(points.T)), (tables,), (tables,)
+        lambda c: eqx.tree_at(lambda f: f.coefficients, field, c).depth_home(points.T), (tables,), (tables,)
     )
     np.testing.assert_allclose(*along, atol=1e-12)  # linear in the table, inside the grid
 
@@ -132,7 +132,7 @@ def test_probes_are_skinned_vertices(heavy):
     mine = np.flatnonzero(heavy.part_of_vertex == mf._character.PARTS.index("left_upper_arm"))[::7]
     kin = mf.forward_kinematics(heavy.skeleton, walk)
     exact = mf.skin(heavy.skin, kin)[0][:, mine]
-    told = jnp.moveaxis(make_probes(heavy, "left_upper_arm", mine).positions_world(kin), 0, -1)
+    told = jnp.moveaxis(make_probes(heavy, "left_upper_arm", mine).positions_world(kin), 1, -1)
     error = np.linalg.norm(told - exact, axis=-1)
     assert np.median(error) < 1e-4 and error.max() < 0.025  # weights of joints further away are left out
 

@@ -52,57 +52,154 @@ class DepthField(eqx.Module):
     axis_home: Float[AnyArray, "3"]
     takeover: Float[AnyArray, "_ 2"]
 
-    def depth_home(self, points_home: Sequence[Float[AnyArray, "*points"]]) -> Float[Array, "*points"]:
-        """Depth [m] of points given in the tabulated pose, one array per coordinate."""
-        inside, gap = self._cells(points_home)
-        return _lookup(jnp.asarray(self.coefficients)[None], *inside)[0] - gap
+    def depth_home(self, points_home: Float[AnyArray, "*frames 3 points"]) -> Float[Array, "*frames points"]:
+        """Depth [m] of points given in the tabulated pose."""
+        return _Meeting.of((self,), (points_home.shape[-1],)).depth_home(jnp.asarray(points_home))
 
-    def _cells(self, points_home) -> tuple[list[Array], Array]:
-        """Grid coordinates clipped to the grid, and the distance [m] to it, which counts as a gap."""
-        origin, spacing = jnp.asarray(self.origin), jnp.asarray(self.spacing)
-        cells = [(points_home[a] - origin[a]) / spacing[a] for a in range(3)]
-        # half a cell is the spline's reach
-        inside = [jnp.clip(c, 0.5, n - 1.5001) for c, n in zip(cells, self.coefficients.shape, strict=True)]
-        return inside, sum(jnp.abs(cells[a] - inside[a]) * spacing[a] for a in range(3))
-
-    def to_home(self, kin: Kinematics, points_world: Float[Array, "3 frames points"]) -> list[Array]:
-        """World points taken to the tabulated pose, one array per coordinate.
-
-        Written out one component at a time: long contiguous vectors, where a trailing axis of 3 or a sum over a
-        leading one is several times slower on the CPU. The barriers keep XLA from computing what all points share
-        anew for each of them.
-        """
-        joints = jnp.asarray(self.joints)
-        turns = jnp.asarray(self.home_rotations) @ jnp.swapaxes(
-            rotation.to_matrix(kin.rotations_world[:, joints]), -1, -2
-        )
-        places = kin.positions_world[:, joints]
-        shifts = jnp.asarray(self.home_positions) - jnp.sum(turns * places[:, :, None, :], axis=-1)
-        turns, shifts = _once((turns, shifts))
-        moved = _once([
-            [shifts[:, j, a, None] + sum(turns[:, j, a, b, None] * points_world[b] for b in range(3)) for a in range(3)]
-            for j in range(len(self.joints))
-        ])  # fmt: skip
-        *chain, first, second = moved
-        home = chain[0]
-        if len(chain) > 1:
-            axis = jnp.asarray(self.axis_home)
-            height = sum(axis[a] * sum(m[a] for m in chain) / len(chain) for a in range(3))
-            shares = _once([_smoothstep((height - low) / (high - low)) for low, high in jnp.asarray(self.takeover)])
-            home = [
-                home[a] + sum(s * (m[a] - before[a]) for s, before, m in zip(shares, chain, chain[1:], strict=False))
-                for a in range(3)
-            ]
-        inside, _ = self._cells(home)
-        pulls = _once(_lookup(jnp.asarray(self.pulls), *inside))
-        return [h + pulls[0] * (f - h) + pulls[1] * (g - h) for h, f, g in zip(home, first, second, strict=True)]
-
-    def depth(self, kin: Kinematics, points_world: Float[Array, "3 frames points"]) -> Float[Array, "frames points"]:
+    def depth(self, kin: Kinematics, points_world: Float[AnyArray, "frames 3 points"]) -> Float[Array, "frames points"]:
         """Depth [m] of world points below the posed part's skin; negative outside."""
-        return self.depth_home(self.to_home(kin, points_world))
+        return depths(kin, (self,), (jnp.asarray(points_world),))
 
 
-_once = jax.lax.optimization_barrier
+def depths(
+    kin: Kinematics, fields: Sequence[DepthField], points_world: Sequence[Float[Array, "frames 3 _"]]
+) -> Float[Array, "frames all_points"]:
+    """Depth [m] of each field's own points below its skin, those of all fields side by side.
+
+    One program for all fields: what is compiled is the same for a trunk on four joints as for a thigh on one.
+    """
+    longest = max(len(field.joints) for field in fields) - 2
+
+    def filled(x):  # a shorter chain repeats its last joint, which changes nothing
+        x = jnp.asarray(x)
+        return jnp.concatenate([x[:-2], *[x[-3:-2]] * (longest + 2 - len(x)), x[-2:]])
+
+    joints, home_rotations, home_positions = (
+        jnp.stack([filled(getattr(field, name)) for field in fields])
+        for name in ("joints", "home_rotations", "home_positions")
+    )
+    turns = home_rotations @ jnp.swapaxes(rotation.to_matrix(kin.rotations_world[:, joints]), -1, -2)
+    places = kin.positions_world[:, joints]
+    shifts = home_positions - rotation.matrix_times(turns, places)
+    moves = jnp.concatenate([turns, shifts[..., None]], axis=-1)  # (frames, fields, joints, 3, 4)
+    meeting = _Meeting.of(fields, tuple(p.shape[-1] for p in points_world))
+    return _depth(meeting, tuple(moves[:, k] for k in range(len(fields))), tuple(points_world))
+
+
+class _Meeting(eqx.Module):
+    """Points and the fields that they meet: for each point the numbers of its own field. `tables` are the depth and
+    the two pulls, the grids of all fields one after the other."""
+
+    tables: Float[Array, "3 nodes"]
+    start: Int[Array, " points"]
+    size: Int[Array, "3 points"]
+    origin: Float[Array, "3 points"]
+    spacing: Float[Array, "3 points"]
+    axis: Float[Array, "3 points"]
+    takeover: Float[Array, "joins 2 points"]
+
+    @classmethod
+    def of(cls, fields: Sequence[DepthField], counts: Sequence[int]) -> "_Meeting":
+        def spread(values):
+            wide = [
+                jnp.broadcast_to(jnp.asarray(v)[..., None], (*jnp.shape(v), n))
+                for v, n in zip(values, counts, strict=True)
+            ]
+            return jnp.concatenate(wide, axis=-1)
+
+        joins = max(len(f.takeover) for f in fields)
+        idle = np.array([[0.0, 1.0]])
+        takeover = [jnp.concatenate([jnp.asarray(f.takeover), *[idle] * (joins - len(f.takeover))]) for f in fields]
+        sizes = [f.coefficients.shape for f in fields]
+        starts = np.cumsum([0, *(np.prod(s) for s in sizes)])[:-1].astype(np.int32)
+        tables = [
+            jnp.concatenate([jnp.asarray(f.coefficients)[None], jnp.asarray(f.pulls)]).reshape(3, -1) for f in fields
+        ]
+        return cls(jnp.concatenate(tables, axis=1), spread(starts), spread([np.array(s, np.int32) for s in sizes]),
+                   spread([f.origin for f in fields]), spread([f.spacing for f in fields]),
+                   spread([f.axis_home for f in fields]), spread(takeover))  # fmt: skip
+
+    def cells(self, points_home: Float[Array, "*frames 3 points"]) -> tuple[Array, Array]:
+        """Grid coordinates clipped to the grid, and the distance [m] to it, which counts as a gap."""
+        cells = (points_home - self.origin) / self.spacing
+        inside = jnp.clip(cells, 0.5, self.size.astype(cells.dtype) - 1.5001)  # half a cell is the spline's reach
+        return inside, _over_coordinates(jnp.abs(cells - inside) * self.spacing)
+
+    def depth_home(self, points_home: Float[Array, "*frames 3 points"]) -> Float[Array, "*frames points"]:
+        inside, gap = self.cells(points_home)
+        return _lookup(self.tables[:1], self.start, self.size, inside)[0] - gap
+
+    def home(
+        self, chain: Float[Array, "frames chained 3 points"], first: Float[Array, "frames 3 points"],
+        second: Float[Array, "frames 3 points"],
+    ) -> Float[Array, "frames 3 points"]:  # fmt: skip
+        """Points in the tabulated pose, from where the chain's joints and the two that pull alone would take them."""
+        home = chain[:, 0]
+        if len(self.takeover):
+            height = _over_coordinates(self.axis * jnp.mean(chain, axis=1))
+            taken = _smoothstep((height[:, None] - self.takeover[:, 0]) / (self.takeover[:, 1] - self.takeover[:, 0]))
+            ones = jnp.ones_like(taken[:, :1])
+            shares = jnp.concatenate([ones, taken], axis=1) - jnp.concatenate([taken, 0 * ones], axis=1)
+            home = jnp.sum(shares[:, :, None] * chain, axis=1)
+        inside, _ = self.cells(home)
+        one, other = (pull[..., None, :] for pull in _lookup(self.tables[1:], self.start, self.size, inside))
+        return home + one * (first - home) + other * (second - home)
+
+
+def _moved(moves, points):
+    """Where the chain's joints (frames, chained, 3, all points) and the two that pull take each field's points."""
+    frames, joints = moves[0].shape[:2]
+    # one product per frame and field for all joints: (3 joints, 3) @ (3, points)
+    moved = [m[..., :3].reshape(frames, -1, 3) @ p for m, p in zip(moves, points, strict=True)]
+    shifts = [m[..., 3].reshape(frames, -1, 1) for m in moves]
+    moved = jnp.concatenate([a + b for a, b in zip(moved, shifts, strict=True)], axis=-1)
+    moved = moved.reshape(frames, joints, 3, -1)
+    return moved[:, :-2], moved[:, -2], moved[:, -1]
+
+
+def _depth_of(meeting: _Meeting, moves, points):
+    return meeting.depth_home(meeting.home(*_moved(moves, points)))
+
+
+_depth = eqx.filter_custom_jvp(_depth_of)
+
+
+@_depth.def_jvp
+def _depth_jvp(primals, tangents):
+    """A point's depth depends on its own coordinates alone, so its gradient in where each joint takes it is one
+    backward pass. Every tangent is then a sum of products: with the point's own way, and with the joints' ways."""
+    meeting, moves, points = primals
+    t_meeting, t_moves, t_points = tangents
+    value, back = jax.vjp(lambda *moved: meeting.depth_home(meeting.home(*moved)), *_moved(moves, points))
+    chain, first, second = back(jnp.ones_like(value))
+    slopes = jnp.concatenate([chain, first[:, None], second[:, None]], axis=1)
+    frames, joints = moves[0].shape[:2]
+    ends = np.cumsum([p.shape[-1] for p in points])[:-1]
+    ways = []
+    for m, p, slope, t_m, t_p in zip(moves, points, jnp.split(slopes, ends, axis=-1), t_moves, t_points, strict=True):
+        way = jnp.zeros((frames, p.shape[-1]), value.dtype)
+        if t_p is not None:
+            own = jnp.swapaxes(m[..., :3].reshape(frames, -1, 3), 1, 2) @ slope.reshape(frames, 3 * joints, -1)
+            way = way + _over_coordinates(_once(own) * t_p)
+        if t_m is not None:
+            arms = jnp.concatenate([p, jnp.ones_like(p[:, :1])], axis=1)
+            levers = _once((slope[:, :, :, None] * arms[:, None, None]).reshape(frames, 12 * joints, -1))
+            way = way + jnp.einsum("tk,tkn->tn", t_m.reshape(frames, -1), levers)
+        ways.append(way)
+    tangent = jnp.concatenate(ways, axis=-1)
+    if any(leaf is not None for leaf in jax.tree.leaves(t_meeting)):
+        tangent = (
+            tangent + eqx.filter_jvp(lambda meeting: _depth_of(meeting, moves, points), (meeting,), (t_meeting,))[1]
+        )
+    return value, tangent
+
+
+_once = jax.lax.optimization_barrier  # keeps XLA from computing what all tangents share anew for each of them
+
+
+def _over_coordinates(x):
+    """The sum over the three coordinates, the last axis but one."""
+    return x[..., 0, :] + x[..., 1, :] + x[..., 2, :]
 
 
 def _smoothstep(x):
@@ -110,73 +207,70 @@ def _smoothstep(x):
     return x * x * (3.0 - 2.0 * x)
 
 
-def _cells(shape: tuple[int, ...], point: tuple) -> tuple[list[Array], Array]:
-    """Offsets of grid coordinates from their nearest node, and the flat index of the first of the 27 neighbours."""
-    nodes = [jnp.round(c) for c in point]
-    i, j, k = (n.astype(jnp.int32) - 1 for n in nodes)
-    return [c - n for c, n in zip(point, nodes, strict=True)], (i * shape[1] + j) * shape[2] + k
-
-
-def _weights(offset) -> tuple:
-    return 0.5 * (0.5 - offset) ** 2, 0.75 - offset * offset, 0.5 * (0.5 + offset) ** 2
-
-
-def _slopes(offset) -> tuple:
-    return offset - 0.5, -2.0 * offset, offset + 0.5
-
-
-def _dot(a, b):
-    return sum(x * y for x, y in zip(a, b, strict=True))
-
-
 _COLUMNS = np.array([(a, b) for a in range(3) for b in range(3)], np.int32)
 
 
+def _neighbours(size, start, cells):
+    """Offsets of grid coordinates from their nearest node, and the index of the first of the 27 neighbours."""
+    nodes = jnp.round(cells)
+    i, j, k = (nodes[..., a, :].astype(jnp.int32) - 1 for a in range(3))
+    return cells - nodes, start + (i * size[1] + j) * size[2] + k
+
+
+def _weights(offsets) -> Array:
+    return jnp.stack([0.5 * (0.5 - offsets) ** 2, 0.75 - offsets * offsets, 0.5 * (0.5 + offsets) ** 2])
+
+
+def _slopes(offsets) -> Array:
+    return jnp.stack([offsets - 0.5, -2.0 * offsets, offsets + 0.5])
+
+
+def _along(tables, size, base, at):
+    """The three neighbours along z in column (a, b): (3, tables, points...)."""
+    place = base + (at[0] * size[1] + at[1]) * size[2]
+    return [tables.at[:, place + c].get(mode="promise_in_bounds") for c in range(3)]
+
+
+def _dot(weights, values):
+    return sum(weights[c] * values[c] for c in range(3))
+
+
 @eqx.filter_custom_jvp
-def _lookup(tables, x, y, z):
-    """Triquadratic B-splines, (tables, points...), at grid coordinates: 27 neighbours, scanned column by column so
-    that the program stays small."""
-    offsets, base = _cells(tables.shape[1:], (x, y, z))
-    wx, wy = (jnp.stack(_weights(o)) for o in offsets[:2])
+def _lookup(tables, start, size, cells):
+    """Triquadratic B-splines, (tables, frames..., points), at grid coordinates: 27 neighbours, scanned column by column
+    so that the program stays small."""
+    offsets, base = _neighbours(size, start, cells)
+    weights = jnp.moveaxis(_weights(offsets), -2, 0)  # (coordinate, neighbour, frames..., points)
 
     def column(total, at):
-        a, b = at
-        along = _along(tables, base, a, b, _weights(offsets[2]))
-        return total + wx[a] * wy[b] * along, None
+        along = _along(tables, size, base, at)
+        return total + weights[0][at[0]] * weights[1][at[1]] * _dot(weights[2], along), None
 
-    return jax.lax.scan(column, jnp.zeros((len(tables), *x.shape), x.dtype), tuple(_COLUMNS.T))[0]
-
-
-def _along(tables, base, a, b, weights):
-    """The weighted three neighbours along z in column (a, b)."""
-    _, _, ny, nz = tables.shape
-    flat, place = tables.reshape(len(tables), -1), base + (a * ny + b) * nz
-    return _dot(weights, [flat.at[:, place + c].get(mode="promise_in_bounds") for c in range(3)])
+    return jax.lax.scan(column, jnp.zeros((len(tables), *base.shape), cells.dtype), _COLUMNS)[0]
 
 
 @_lookup.def_jvp
 def _lookup_jvp(primals, tangents):
     """The gradient in closed form, once: every further tangent is then three products per point."""
-    tables, x, y, z = primals
-    t_tables, *t_points = tangents
+    tables, start, size, cells = primals
+    t_tables, _, _, t_cells = tangents
     # neither the offsets nor the gradient may be computed anew for each of the tangents
-    offsets, base = _once(_cells(tables.shape[1:], (x, y, z)))
-    (wx, wy, wz), (sx, sy, sz) = (tuple(jnp.stack(f(o)) for o in offsets) for f in (_weights, _slopes))
+    offsets, base = _once(_neighbours(size, start, cells))
+    (wx, wy, wz), (sx, sy, sz) = (jnp.moveaxis(f(offsets), -2, 0) for f in (_weights, _slopes))
 
     def column(totals, at):
-        a, b = at
-        level, steep = _along(tables, base, a, b, wz), _along(tables, base, a, b, sz)
-        parts = wx[a] * wy[b] * level, sx[a] * wy[b] * level, wx[a] * sy[b] * level, wx[a] * wy[b] * steep
+        along, (a, b) = _along(tables, size, base, at), at
+        level = _dot(wz, along)
+        parts = wx[a] * wy[b] * level, sx[a] * wy[b] * level, wx[a] * sy[b] * level, wx[a] * wy[b] * _dot(sz, along)
         return tuple(t + p for t, p in zip(totals, parts, strict=True)), None
 
-    zero = jnp.zeros((len(tables), *x.shape), x.dtype)
-    value, *gradient = _once(jax.lax.scan(column, (zero,) * 4, tuple(_COLUMNS.T))[0])
+    zero = jnp.zeros((len(tables), *base.shape), cells.dtype)
+    value, *gradient = _once(jax.lax.scan(column, (zero,) * 4, _COLUMNS)[0])
     tangent = jnp.zeros_like(value)
-    for slope, t in zip(gradient, t_points, strict=True):
-        if t is not None:
-            tangent = tangent + slope * t
+    if t_cells is not None:
+        tangent = sum(slope * t_cells[..., a, :] for a, slope in enumerate(gradient))
     if t_tables is not None:
-        tangent = tangent + _lookup(t_tables, x, y, z)
+        tangent = tangent + _lookup(t_tables, start, size, cells)
     return value, tangent
 
 
@@ -365,14 +459,14 @@ class Probes(eqx.Module):
     joints: Int[AnyArray, " carrying"]
     blend: Float[AnyArray, "carrying 4 points"]
 
-    def positions_world(self, kin: Kinematics) -> Float[Array, "3 frames points"]:
-        """World positions [m], coordinates first."""
+    def positions_world(self, kin: Kinematics) -> Float[Array, "frames 3 points"]:
+        """World positions [m]."""
         turns, shifts = kin.skin_transforms(jnp.asarray(self.joints))
         moves = jnp.concatenate([turns, shifts[..., None]], axis=-1)
         blend = jnp.asarray(self.blend, moves.dtype)
         frames, carrying = moves.shape[:2]
-        rows = jnp.moveaxis(moves, 2, 0).reshape(3 * frames, carrying * 4)
-        return (rows @ blend.reshape(carrying * 4, -1)).reshape(3, frames, -1)
+        rows = jnp.moveaxis(moves, 2, 1).reshape(3 * frames, carrying * 4)
+        return (rows @ blend.reshape(carrying * 4, -1)).reshape(frames, 3, -1)
 
     def __getitem__(self, points: np.ndarray) -> "Probes":
         return Probes(self.joints, self.blend[..., points])

@@ -5,7 +5,6 @@ body in the same frame (method: adjacent segments always overlap a little at the
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -16,7 +15,7 @@ from motionfit._motion import Kinematics
 from motionfit._problem import Term
 from motionfit._types import AnyArray
 from motionfit.shape.distance import capsule_depth, cylinder_depth
-from motionfit.shape.field import DepthField, Probes
+from motionfit.shape.field import DepthField, Probes, depths
 from motionfit.shape.volumes import Volumes
 
 
@@ -104,21 +103,12 @@ class SkinClearance(Term):
     def point_depths(self, kin: Kinematics) -> list[Float[Array, "frames points"]]:
         """Depth [m] of every point, set by set; negative outside."""
         points = [p.positions_world(kin) for p in self.probes]
-        depths: list[Array] = [jnp.zeros(())] * len(points)
-        # fields of one shape are looked up together, each over all the probes that meet it: the program stays small
-        meeting = [[i for i, owner in enumerate(self.field_of) if owner == k] for k in range(len(self.fields))]
-        met = [jnp.concatenate([points[i] for i in some], axis=2) for some in meeting]
-        alike: dict[tuple, list[int]] = {}
-        for k, field in enumerate(self.fields):
-            alike.setdefault((met[k].shape, *(jnp.shape(x) for x in jax.tree.leaves(field))), []).append(k)
-        for group in alike.values():
-            fields = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(y) for y in x]), *(self.fields[k] for k in group))
-            together = jax.vmap(lambda field, p: field.depth(kin, p))(fields, jnp.stack([met[k] for k in group]))
-            for k, depth in zip(group, together, strict=True):
-                split = np.cumsum([points[i].shape[2] for i in meeting[k]])[:-1]
-                for i, part in zip(meeting[k], jnp.split(depth, split, axis=1), strict=True):
-                    depths[i] = part
-        return depths
+        order = [i for k in range(len(self.fields)) for i, owner in enumerate(self.field_of) if owner == k]
+        counts = [sum(points[i].shape[2] for i in order if self.field_of[i] == k) for k in range(len(self.fields))]
+        together = jnp.concatenate([points[i] for i in order], axis=2)
+        met = jnp.split(together, np.cumsum(counts)[:-1], axis=2)
+        split = jnp.split(depths(kin, self.fields, met), np.cumsum([points[i].shape[2] for i in order])[:-1], axis=1)
+        return [split[order.index(i)] for i in range(len(points))]
 
     def depth(self, kin: Kinematics) -> Float[Array, "frames sets"]:
         """Depth [m] of the deepest point of every set in every frame; negative where all are outside."""
