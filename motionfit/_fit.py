@@ -109,32 +109,42 @@ def levenberg_marquardt(
 
 
 @eqx.filter_custom_jvp
-def _frame_local_rows(signals: Float[Array, "frames controls"], rows: Callable) -> tuple[Array, ...]:
-    """Rows (frames, n) of terms that look at one frame at a time, with a cheap Jacobian in the control points.
+def _with_columns(x: tuple[Array, ...], fn: Callable, columns_of: Callable, times: Callable) -> tuple[Array, ...]:
+    """Rows fn(x), (frames, n) each, whose Jacobian has few distinct columns: `columns_of(x, fn)` tells value and
+    columns, `times(columns, t_x)` the product. It is computed once per linearisation, and every product with it,
+    transposed or not, is then a few lines; without this rule each would be one more pass through the kinematics, and
+    one more copy of it to compile."""
+    del columns_of, times
+    return fn(x)
 
-    Row t depends on the signals of frame t only, so d row_t / d signal_c for *all* t comes from one product with
-    the seed "signal c = 1 in every frame". The tangent of any control point is then a sum over controls; without
-    this rule each control point would cost one pass through the kinematics.
-    """
-    return rows(signals)
 
-
-@_frame_local_rows.def_jvp
-def _frame_local_rows_jvp(primals, tangents):
-    signals, rows = primals
-    t_signals, t_rows = tangents
-    if t_signals is not None:
-        seeds = jnp.eye(signals.shape[1], dtype=signals.dtype)[:, None, :] * jnp.ones_like(signals)
-        product = jax.vmap(lambda seed: jax.jvp(rows, (signals,), (seed,)), out_axes=(None, 0))
-        value, columns = product(seeds)
-        tangent = jax.tree.map(lambda c: jnp.einsum("tc,ctn->tn", t_signals, c), columns)
+@_with_columns.def_jvp
+def _with_columns_jvp(primals, tangents):
+    x, fn, columns_of, times = primals
+    t_x, t_fn, *_ = tangents
+    if any(t is not None for t in t_x):
+        t_x = tuple(jnp.zeros_like(p) if t is None else t for p, t in zip(x, t_x, strict=True))
+        value, columns = columns_of(x, fn)
+        tangent = times(columns, t_x)
     else:
-        value = rows(signals)
+        value = fn(x)
         tangent = jax.tree.map(jnp.zeros_like, value)
-    if any(leaf is not None for leaf in jax.tree.leaves(t_rows)):
-        _, extra = eqx.filter_jvp(lambda r: r(signals), (rows,), (t_rows,))
+    if any(leaf is not None for leaf in jax.tree.leaves(t_fn)):
+        _, extra = eqx.filter_jvp(lambda f: f(x), (fn,), (t_fn,))
         tangent = jax.tree.map(jnp.add, tangent, extra)
     return value, tangent
+
+
+def _columns_of_signals(x, fn):
+    """Of rows that look at one frame at a time: d row_t / d signal_c for *all* t comes from one product with the seed
+    "signal c = 1 in every frame"."""
+    (signals,) = x
+    seeds = jnp.eye(signals.shape[1], dtype=signals.dtype)[:, None, :] * jnp.ones_like(signals)
+    return jax.vmap(lambda seed: jax.jvp(fn, (x,), ((seed,),)), out_axes=(None, 0))(seeds)
+
+
+def _times_signals(columns, t_x):
+    return jax.tree.map(lambda c: jnp.einsum("tc,ctn->tn", t_x[0], c), columns)
 
 
 class _Rows(eqx.Module):
@@ -146,13 +156,28 @@ class _Rows(eqx.Module):
     terms: tuple[int, ...] = eqx.field(static=True)
 
     @eqx.filter_jit  # traced once, however often a solver's program evaluates it
-    def __call__(self, signals: Float[Array, "frames free"]) -> tuple[Float[Array, "frames _"], ...]:
+    def __call__(self, x: tuple[Float[Array, "frames free"]]) -> tuple[Float[Array, "frames _"], ...]:
+        (signals,) = x
         kin = self.objective.kinematics(self.fixed.at[:, self.free].set(signals))
         return tuple(
             jnp.sqrt(self.objective.weights[k])
             * self.objective.terms[k].residual(kin).reshape(signals.shape[0], -1)  # type: ignore
             for k in self.terms
         )
+
+
+class _PointRows(eqx.Module):
+    """The same as a function of the free controls' points."""
+
+    controls: tuple[Control, ...]
+    rows: _Rows
+
+    def __call__(self, points: tuple[Array, ...]) -> tuple[Array, ...]:
+        return self.rows((_signals(self.controls, points),))
+
+
+def _signals(controls: tuple[Control, ...], points: tuple[Array, ...]) -> Float[Array, "frames controls"]:
+    return jnp.stack([c.signal(p) for c, p in zip(controls, points, strict=True)], axis=1)
 
 
 class _Remembers(eqx.Module):
@@ -220,27 +245,26 @@ class Solved(NamedTuple):
 
 def solve_block(work: Work, solver, max_steps: int, adjoint: optx.AbstractAdjoint) -> Solved:
     """Run one block's solver; a pure function of arrays, to be jitted, vmapped or differentiated."""
-    terms = range(len(work.objective.terms))
-    local = tuple(k for k in terms if work.objective.terms[k].reach == 0)
-    other = tuple(k for k in terms if k not in local)
-
-    def signals_of(x, controls):
-        return jnp.stack([c.signal(p) for c, p in zip(controls, x, strict=True)], axis=1)
+    banded = _banded_inside(solver)
 
     def joined(rows, frames):
         return jnp.concatenate(rows, axis=1) if rows else jnp.zeros((frames, 0))
 
     def residuals(x, args):
         objective, controls, free, fixed = args
-        signals = signals_of(x, controls)
-        rows = (_frame_local_rows(signals, _Rows(objective, fixed, free, local)),
-                _Rows(objective, fixed, free, other)(signals))  # fmt: skip
+        terms = range(len(objective.terms))
+        local = tuple(k for k in terms if objective.terms[k].reach == 0)  # type: ignore
+        other = tuple(k for k in terms if k not in local)
+        signals = (_signals(controls, x),)
+        far = _PointRows(controls, _Rows(objective, fixed, free, other))
+        rows = (_with_columns(signals, _Rows(objective, fixed, free, local), _columns_of_signals, _times_signals),
+                far(x) if banded is None else _with_columns(x, far, banded.columns_of, banded.times))  # fmt: skip
         costs = {k: 0.5 * jnp.sum(jnp.square(r)) for k, r in zip(local + other, rows[0] + rows[1], strict=True)}
-        return tuple(joined(r, len(signals)) for r in rows), tuple(costs[k] for k in terms)
+        return tuple(joined(r, len(fixed)) for r in rows), tuple(costs[k] for k in terms)
 
     def energy(x, args):
         objective, controls, free, fixed = args
-        kin = objective.kinematics(fixed.at[:, free].set(signals_of(x, controls)))
+        kin = objective.kinematics(fixed.at[:, free].set(_signals(controls, x)))
         costs = tuple(w * term_cost(t, kin) for t, w in zip(objective.terms, objective.weights, strict=True))
         return sum(costs), costs
 
@@ -280,8 +304,13 @@ def banded_solver(problem: Problem, block: Block) -> Banded | None:
 # optimistix's default adjoint calls a system singular where a control cannot be observed (no frame in contact)
 def block_adjoint(solver) -> optx.ImplicitAdjoint:
     """Implicit derivatives through a solve, by the block's own banded solver where it has one."""
+    banded = _banded_inside(solver)
+    return optx.ImplicitAdjoint(lx.AutoLinearSolver(well_posed=False) if banded is None else banded)
+
+
+def _banded_inside(solver) -> Banded | None:
     inner = getattr(getattr(solver, "descent", None), "linear_solver", None)
-    return optx.ImplicitAdjoint(inner if isinstance(inner, Banded) else lx.AutoLinearSolver(well_posed=False))
+    return inner if isinstance(inner, Banded) else None
 
 
 @eqx.filter_jit
@@ -300,8 +329,7 @@ def _reach_errors(work: Work, reaches: tuple[int, ...], solver: Banded) -> tuple
     for k in range(len(objective.terms)):
 
         def rows(x, k=k):
-            signals = jnp.stack([c.signal(p) for c, p in zip(work.controls, x, strict=True)], axis=1)
-            return _Rows(objective, fixed, work.free, (k,))(signals)[0]
+            return _PointRows(work.controls, _Rows(objective, fixed, work.free, (k,)))(x)[0]
 
         value, product = jax.linearize(rows, start)
         operator = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: start))

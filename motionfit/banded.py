@@ -10,6 +10,7 @@ products must stay traceable inside an optimistix solver, and the columns must c
 sparse matrix: they would add a dependency and save nothing.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -97,12 +98,23 @@ class Banded(lx.AbstractLinearSolver):
     def columns(self, operator, controls: int, points: int, period: int) -> list[Array]:
         """One product per control and colour: leaves (controls * period, ...)."""
         unknowns = operator.in_structure()
-        dtype = jax.tree.leaves(unknowns)[0].dtype
-        colours = (np.arange(points)[None] % period == np.arange(period)[:, None]).astype(float)
-        seeds = np.einsum("cd,pk->cpdk", np.eye(controls), colours).reshape(controls * period, controls, points)
-        seeds = jnp.asarray(seeds, dtype)
+        seeds = _seeds(controls, points, period, jax.tree.leaves(unknowns)[0].dtype)
         tree = jax.tree.unflatten(jax.tree.structure(unknowns), [seeds[:, c] for c in range(controls)])
         return jax.tree.leaves(jax.vmap(operator.mv)(tree))
+
+    def columns_of(self, x: tuple[Array, ...], fn: Callable) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        """Rows fn(x) of the control points x, (frames, n) each, and all of their Jacobian that is not zero, by control
+        and colour: (controls * width, frames, n)."""
+        seeds = _seeds(len(x), len(x[0]), self.width, x[0].dtype)
+        product = jax.vmap(lambda seed: jax.jvp(fn, (x,), ((*seed,),)), out_axes=(None, 0))
+        return product(seeds)
+
+    def times(self, columns: tuple[Array, ...], x: tuple[Array, ...]) -> tuple[Array, ...]:
+        """The product of such a Jacobian with control points."""
+        order = np.arange(self.width, dtype=np.int32) - jnp.asarray(self.first)[:, None]
+        own = jnp.stack(x, axis=0)[:, jnp.asarray(self.first)[:, None] + order % self.width]  # (controls, frames, width)
+        own = jnp.moveaxis(own, 2, 1).reshape(-1, own.shape[1])
+        return jax.tree.map(lambda c: jnp.einsum("kt,ktn->tn", own, c), columns)
 
     def windows(self, rows: Float[Array, "colours frames n"], controls: int) -> Float[Array, "points window rows"]:
         """Jacobian rows by the control point that their window starts at: (points, width * controls, rows * n)."""
@@ -174,6 +186,12 @@ def _gram_of_multiples(
     share = jnp.sum(columns * total[:, None], axis=-1) / jnp.where(size > 0.0, size, 1.0)[:, None]
     products = jnp.einsum("ctn,dtn->tcd", total, total)
     return jnp.einsum("cpt,dqt,tcd->tpcqd", share, share, products)
+
+
+def _seeds(controls: int, points: int, period: int, dtype) -> Float[Array, "colours controls points"]:
+    colours = (np.arange(points)[None] % period == np.arange(period)[:, None]).astype(float)
+    seeds = np.einsum("cd,pk->cpdk", np.eye(controls), colours).reshape(controls * period, controls, points)
+    return jnp.asarray(seeds, dtype)
 
 
 def _size(unknowns) -> tuple[int, int]:

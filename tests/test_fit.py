@@ -96,7 +96,7 @@ def test_nothing_to_do_and_zero_correction_are_bit_for_bit(still):
 
 def test_frame_local_rule_gives_the_same_jacobian(still):
     """The one product per control against plain forward mode."""
-    from motionfit._fit import _frame_local_rows, _Rows
+    from motionfit._fit import _columns_of_signals, _Rows, _times_signals, _with_columns
 
     character, motion = still
     controls = tuple(_control(character, motion, r) for r in ("left_upper_arm", "left_forearm"))
@@ -104,8 +104,8 @@ def test_frame_local_rule_gives_the_same_jacobian(still):
     problem = mf.Problem(character, motion, {"t": mf.terms.JointTracking(hand, np.zeros((20, 1, 3)))}, controls)
     rows = _Rows(problem.objective(), jnp.zeros((20, 2)), jnp.array([0, 1]), (0,))
     signals = jnp.asarray(np.random.default_rng(1).normal(size=(20, 2)))
-    fast = jax.jacfwd(lambda s: _frame_local_rows(s, rows))(signals)
-    np.testing.assert_allclose(fast, jax.jacfwd(rows)(signals), atol=1e-9)
+    fast = jax.jacfwd(lambda s: _with_columns((s,), rows, _columns_of_signals, _times_signals)[0])(signals)
+    np.testing.assert_allclose(fast, jax.jacfwd(lambda s: rows((s,))[0])(signals), atol=1e-9)
 
 
 def test_new_numbers_do_not_recompile(still):
