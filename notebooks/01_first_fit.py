@@ -70,10 +70,10 @@ thirds = np.array_split(np.arange(len(before)), 3)
 moments = [int(fit.details["frames"][third[before[third].max(axis=1).argmax()]]) for third in thirds]
 figure, axes = plt.subplots(1, 2, figsize=(12, 4.4), sharex=True, sharey=True, constrained_layout=True)
 for ax, (name, motion) in zip(axes, (("before", fit.base), ("after", fit.motion)), strict=True):
-    for place, frame in enumerate(moments):
-        vertices = mf.metrics.posed_vertices(body, motion[[frame]])[0] - np.asarray(motion.root)[frame] * [1, 0, 1]
+    here = np.asarray(motion.root)[moments, None] * [1, 0, 1]
+    for place, vertices in enumerate(mf.metrics.posed_vertices(body, motion[np.array(moments)]) - here):
         view.draw_body(ax, vertices, np.asarray(body.skin.faces), yaw=0.3, shift=1.2 * place)
-        ax.text(1.2 * place, -0.12, f"{frame * float(clip.dt):.2f} s", ha="center", fontsize=9)
+        ax.text(1.2 * place, -0.12, f"{moments[place] * float(clip.dt):.2f} s", ha="center", fontsize=9)
     ax.set_title(name)
     ax.set_aspect("equal")
     ax.autoscale_view()

@@ -107,12 +107,13 @@ for name, (term, weights, free) in variants.items():
 
 # %%
 figure, axes = plt.subplots(2, 1, figsize=(9, 4.8), sharex=True, constrained_layout=True)
-axes[1].plot(seconds, 100 * gap(problem.kinematics(), 0.30)[:, 0], "k:", label="nothing done")
+clearance = eqx.filter_jit(lambda signals: 100 * gap(problem.kinematics(signals), 0.30)[:, 0])  # [cm]
+axes[1].plot(seconds, clearance(None), "k:", label="nothing done")
 for name, solved in fits.items():
     signals = solved.correction.signals()
     line = "--" if name == "dense LM" else "-"  # lies on least squares
     axes[0].plot(seconds, np.rad2deg(signals[:, 0]), line)
-    axes[1].plot(seconds, 100 * gap(problem.kinematics(signals), 0.30)[:, 0], line, label=name)
+    axes[1].plot(seconds, clearance(signals), line, label=name)
 axes[1].axhline(0.0, color="0.5", linewidth=0.8, linestyle="--")
 axes[0].set(ylabel="left arm turned [deg]")
 axes[1].set(ylabel="left elbow to capsule [cm]", xlabel="time [s]", xlim=(0, seconds[-1]))
