@@ -142,7 +142,7 @@ class _Rows(eqx.Module):
 
     objective: Objective
     fixed: Float[Array, "frames controls"]  # signals of all controls; the free columns are replaced
-    free: Int[Array, " free"]
+    free: Int[AnyArray, " free"]
     terms: tuple[int, ...] = eqx.field(static=True)
 
     @eqx.filter_jit  # traced once, however often a solver's program evaluates it
@@ -203,7 +203,7 @@ def solve_block(work: Work, solver, max_steps: int, adjoint: optx.AbstractAdjoin
     if least_squares:
         solution = optx.least_squares(residuals, solver, start, arguments, **options)
     else:
-        solution = optx.minimise(lambda x, args: sum(costs(x, args)), solver, start, arguments, **options)
+        solution = optx.minimise(lambda x, args: sum(costs(x, args)), solver, start, arguments, **options)  # pyright: ignore[reportArgumentType]
     both = jax.tree.map(lambda a, b: jnp.stack([a, b]), start, solution.value)
     before_after = jax.lax.map(lambda x: costs(x, arguments), both)
     steps = getattr(solution.state, "num_accepted_steps", solution.stats["num_steps"])
@@ -230,7 +230,7 @@ def banded_solver(problem: Problem, block: Block) -> Banded | None:
     reaches = [problem.terms[k].reach for k in terms if isinstance(problem.terms[k], Term)]  # type: ignore
     if not same or any(r is None for r in reaches):
         return None
-    return Banded.of(bases[0], max(reaches, default=0), local=1)  # `solve_block` gives the frame-local rows first
+    return Banded.of(bases[0], max(reaches, default=0), local=1)  # `solve_block` gives the frame-local rows first  # pyright: ignore[reportArgumentType]
 
 
 # optimistix's default adjoint calls a system singular where a control cannot be observed (no frame in contact)
@@ -277,12 +277,12 @@ def _reach_errors(work: Work, reaches: tuple[int, ...], solver: Banded) -> tuple
 def check_reach(problem: Problem, block: Block, work: Work) -> None:
     """Find out a `Custom` term whose declared reach is wrong, before it quietly spoils every step of the solve."""
     names = tuple(problem.terms) if block.terms is None else block.terms
-    declared = [k for k in names if isinstance(problem.terms[k], Custom) and problem.terms[k].reach is not None]
+    declared = [k for k in names if isinstance(problem.terms[k], Custom) and problem.terms[k].reach is not None]  # pyright: ignore[reportAttributeAccessIssue]
     bases = [c.basis for c in problem.controls if c.name in block.controls]
     for name in declared:
         reach = problem.terms[name].reach  # type: ignore
         alone = work._replace(objective=problem.objective((name,)))
-        (error,) = _reach_errors(alone, (reach,), Banded.of(bases[0], reach))
+        (error,) = _reach_errors(alone, (reach,), Banded.of(bases[0], reach))  # pyright: ignore[reportArgumentType]
         if float(error) > 1e-3:
             raise InputError(f"term {name!r} says reach={reach}, but its rows depend on frames further away than that; "
                              "give mf.Custom(fn, args, reach=R) the R that it needs, or leave reach out")  # fmt: skip

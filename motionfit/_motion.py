@@ -135,7 +135,7 @@ class Kinematics(eqx.Module):
         turn = rotation.multiply(self.rotations_world[:, joints], rotation.conjugate(self.rotations_bind[joints]))
         matrices = rotation.to_matrix(turn)
         moved = jnp.sum(matrices * self.positions_bind[joints][None, :, None, :], axis=-1)
-        return matrices, self.positions_world[:, joints] - moved
+        return matrices, self.positions_world[:, joints] - moved  # pyright: ignore[reportReturnType]
 
 
 def forward_kinematics(

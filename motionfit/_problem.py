@@ -50,7 +50,7 @@ class Custom(Term):
 
     fn: Callable = eqx.field(static=True)
     args: PyTree = eqx.field(converter=lambda tree: jax.tree.map(_array, tree), default=None)
-    frames_around: int | None = eqx.field(static=True)
+    frames_around: int | None = eqx.field(static=True, default=None)
 
     def __init__(self, fn: Callable, args: PyTree = None, *, reach: int | None = None):
         if reach is not None and reach < 0:
@@ -107,7 +107,7 @@ class Robust(Term):
         scaled = self.term.residual(kin) / self.c
         # 2 (sqrt(1+s^2) - 1) = 2 s^2 / (sqrt(1+s^2) + 1): no cancellation for small s, and its root is
         # s * sqrt(2 / (...)), which keeps the sign and is smooth at zero
-        return self.c * scaled * jnp.sqrt(2.0 / (jnp.sqrt(1.0 + scaled * scaled) + 1.0))
+        return jnp.asarray(self.c) * scaled * jnp.sqrt(2.0 / (jnp.sqrt(1.0 + scaled * scaled) + 1.0))
 
 
 class Problem(eqx.Module):
@@ -200,7 +200,7 @@ class Objective(eqx.Module):
     def costs(self, points: tuple[Float[AnyArray, " _"], ...]) -> tuple[Float[Array, ""], ...]:
         """1/2 w sum r^2 or w E of each term: the cost convention of _types.py."""
         kin = self.kinematics(self.signals(points))
-        return tuple(w * term_cost(t, kin) for t, w in zip(self.terms, self.weights, strict=True))
+        return tuple(jnp.asarray(w) * term_cost(t, kin) for t, w in zip(self.terms, self.weights, strict=True))
 
 
 @eqx.filter_jit

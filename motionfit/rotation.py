@@ -42,7 +42,7 @@ def multiply(a: Float[AnyArray, "... 4"], b: Float[AnyArray, "... 4"]) -> Float[
 
 def conjugate(q: Float[AnyArray, "... 4"]) -> Float[Array, "... 4"]:
     """The inverse of a unit quaternion."""
-    return q * jnp.array([1.0, -1.0, -1.0, -1.0], dtype=jnp.result_type(q))
+    return jnp.asarray(q) * jnp.array([1.0, -1.0, -1.0, -1.0], dtype=jnp.result_type(q))
 
 
 def rotate(q: Float[AnyArray, "... 4"], v: Float[AnyArray, "... 3"]) -> Float[Array, "... 3"]:

@@ -63,7 +63,7 @@ class DepthField(eqx.Module):
         cells = [(points_home[a] - origin[a]) / spacing[a] for a in range(3)]
         # half a cell is the spline's reach
         inside = [jnp.clip(c, 0.5, n - 1.5001) for c, n in zip(cells, self.coefficients.shape, strict=True)]
-        return inside, sum(jnp.abs(cells[a] - inside[a]) * spacing[a] for a in range(3))
+        return inside, sum(jnp.abs(cells[a] - inside[a]) * spacing[a] for a in range(3))  # pyright: ignore[reportReturnType]
 
     def to_home(self, kin: Kinematics, points_world: Float[Array, "3 frames points"]) -> list[Array]:
         """World points taken to the tabulated pose, one array per coordinate.
@@ -240,8 +240,8 @@ def standing(skeleton: Skeleton, swing: float = 0.0, out: float = 0.035) -> Moti
         down = np.array([sign * np.sin(out), -np.cos(out) * np.cos(swing), np.cos(out) * np.sin(swing)])
         for joint, end in ((arm, elbow), (elbow, hand)):
             bone = positions[end] - positions[joint]
-            laid, _ = Rotation.align_vectors(down[None], (bone / np.linalg.norm(bone))[None])
-            turned[joint] = laid * Rotation.from_quat(world[joint], scalar_first=True)
+            laid, _ = Rotation.align_vectors(down[None], (bone / np.linalg.norm(bone))[None])  # pyright: ignore[reportAssignmentType]
+            turned[joint] = laid * Rotation.from_quat(world[joint], scalar_first=True)  # pyright: ignore[reportArgumentType]
     for joint in sorted(turned):
         above, path = Rotation.identity(), []
         parent = skeleton.parents[joint]

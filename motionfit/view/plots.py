@@ -41,7 +41,9 @@ def draw_body(
     base = SKIN[None] if colors is None else colors[faces[order]].mean(1)
     shaded = np.clip(light[:, None] * base, 0, 1)
     outline = corners[order][:, :, :2] + [shift, 0.0]
-    axes.add_collection(PolyCollection(outline, facecolors=shaded, edgecolors="face", linewidths=0.25, alpha=alpha))
+    # an array is drawn without a copy, which matplotlib's stub does not know
+    faced = PolyCollection(outline, facecolors=shaded, edgecolors="face", linewidths=0.25, alpha=alpha)  # pyright: ignore[reportArgumentType]
+    axes.add_collection(faced)
 
 
 def report_picture(
