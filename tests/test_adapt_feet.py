@@ -135,7 +135,7 @@ def test_a_body_without_a_sole_has_no_entries(average):
     ghost = eqx.tree_at(lambda c: c.skin.joints, average, hips)
     ghost = mf.Character(ghost.skeleton, ghost.skin, "ghost")
     motion = samples.walk(cycles=1)
-    assert standing(ghost, motion, source_stance(ghost, motion)) == {"feet": None, "balance": None}
+    assert measure_standing(ghost, motion, source_stance(ghost, motion)) == {"feet": None, "balance": None}
     with pytest.raises(mf.InputError, match="leave footskate out"):
         mf.adapt(motion, ghost, blocks=("footskate",))
 
