@@ -25,6 +25,7 @@ import pathlib
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +38,7 @@ import motionfit as mf
 from benchmarks.metrics import Metric, has_banded, seconds
 from motionfit import samples
 from motionfit._fit import levenberg_marquardt
+from motionfit._problem import term_cost
 from motionfit.adapt import build_clearance, volume_depths
 from motionfit.shape.pairs import pairs_of
 from motionfit.splines import bspline_basis
@@ -95,7 +97,7 @@ def flat_objective(problem: mf.Problem) -> Callable:
         points = jnp.split(x, counts)
         signals = jnp.stack([c.signal(p) for c, p in zip(problem.controls, points, strict=True)], axis=1)
         kin = problem.kinematics(signals)
-        return sum(problem.weights[k] * 0.5 * jnp.sum(t.residual(kin) ** 2) for k, t in problem.terms.items())
+        return sum(problem.weights[k] * term_cost(t, kin) for k, t in problem.terms.items())
 
     return cost
 
@@ -156,7 +158,7 @@ def solve_with(name: str, problem: mf.Problem, block: mf.Block, cap_s: float = C
 def _slsqp(outcome: Outcome, problem: mf.Problem, cap_s: float) -> Outcome:
     objective = flat_objective(problem)
     differences, eager = outcome.name == "slsqp-differences", outcome.name == "slsqp-exact-eager"
-    evaluate = objective if differences else jax.value_and_grad(objective)
+    evaluate: Any = objective if differences else jax.value_and_grad(objective)
     evaluate = evaluate if eager else jax.jit(evaluate)
     zero = np.zeros(outcome.unknowns)
     with jax.disable_jit(eager):
@@ -302,7 +304,7 @@ def plot(outcomes: list[Outcome], folder: pathlib.Path) -> None:
     import matplotlib.pyplot as plt
 
     names = [n for n in SOLVERS if any(o.name == n and not o.skipped for o in outcomes)]
-    colours = dict(zip(SOLVERS, plt.get_cmap("tab10").colors, strict=False))  # type: ignore[attr-defined]
+    colours: dict[str, Any] = dict(zip(SOLVERS, plt.get_cmap("tab10").colors, strict=False))  # type: ignore[attr-defined]
     figure, axes = plt.subplots(figsize=(7, 5))
     for name in names:
         rows = [o for o in outcomes if o.name == name and not o.skipped]

@@ -223,8 +223,8 @@ def compile_reference() -> float:
 class _CompileCounter:
     count = 0
 
-    def __call__(self, event: str, duration: float, **_) -> None:
-        del duration
+    def __call__(self, event: str, duration_secs: float, **_) -> None:
+        del duration_secs
         if event == "/jax/core/compile/backend_compile_duration":
             self.count += 1
 

@@ -10,10 +10,10 @@ import json
 import sys
 import time
 
-import mink
-import mujoco
+import mink  # pyright: ignore[reportMissingImports]
+import mujoco  # pyright: ignore[reportMissingImports]
 import numpy as np
-import qpsolvers
+import qpsolvers  # pyright: ignore[reportMissingImports]
 
 ITERATIONS = 3  # quadratic programs per frame; one alone lags behind the clip
 GAIN = 0.7  # of the pull to the clip's pose; a full step overshoots where a pair holds it back, and chatters

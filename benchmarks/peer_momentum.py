@@ -12,8 +12,8 @@ import sys
 import time
 
 import numpy as np
-import pymomentum.geometry as geometry
-import pymomentum.solver2 as solver
+import pymomentum.geometry as geometry  # pyright: ignore[reportMissingImports]
+import pymomentum.solver2 as solver  # pyright: ignore[reportMissingImports]
 
 ITERATIONS = 20
 

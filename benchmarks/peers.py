@@ -11,6 +11,7 @@ looked for in this environment, and momentum where a python3.12 is on the path.
 import argparse
 import functools
 import json
+import math
 import os
 import pathlib
 import shutil
@@ -84,7 +85,7 @@ def judge(name: str, work: Work, motion: mf.Motion, frame_s: float, fk_frame_s: 
     left = [p.name for p, worst in zip(work.clearance.pairs, excess.max(axis=0), strict=True) if worst > TOLERANCE]
     return Judged(
         name, frame_s, fk_frame_s, float(excess.max()), float((excess > TOLERANCE).any(1).mean()),
-        joint_angle_deviation(motion, work.motion)[0], derivative_ratio(motion, work.motion, 3),
+        joint_angle_deviation(motion, work.motion)[0], derivative_ratio(motion, work.motion, 3) or math.nan,
         ", ".join(left) if len(left) <= 4 else f"{len(left)} pairs", note,
     )  # fmt: skip
 

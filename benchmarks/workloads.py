@@ -278,7 +278,7 @@ def adaptation(frames: int = FRAMES) -> Iterator[Metric]:
     yield Metric("adapt.excess_left", _left(fit), "m", "lower", 0.05, 2e-4)
     yield Metric("adapt.skin_excess_left", float(skin_left), "m", "lower", 0.05, 2e-4)
     yield Metric("adapt.deviation", joint_angle_deviation(fit.motion, fit.base)[0], "rad", "lower", 0.02, 1e-4)
-    yield Metric("adapt.jerk_ratio", derivative_ratio(fit.motion, fit.base, 3), "ratio", "lower", 0.02)
+    yield Metric("adapt.jerk_ratio", derivative_ratio(fit.motion, fit.base, 3) or math.nan, "ratio", "lower", 0.02)
     yield from calls.metrics
     girth = grow(heavy, {"arms": 1.1})
     yield Metric("adapt.compilations_other_girth", compilations(lambda: run(walk, girth)), "programs", "lower", 0.0)
@@ -326,8 +326,10 @@ def joints_adapt(counts: tuple[int, ...] = (31, 124), frame_count: int = FRAMES)
 
 def girths(count: int) -> list[dict[str, float]]:
     """Girths of the run-time system of thesis 5: three sizes of each arm, each leg and the trunk, 3^5 = 243."""
-    parts = ("trunk", "left_leg", "right_leg", "left_arm", "right_arm")
-    grid = [dict(zip(parts, s, strict=True)) for s in itertools.product((1.0, 1.3, 1.6), repeat=len(parts))]
+    parts: tuple[str, ...] = ("trunk", "left_leg", "right_leg", "left_arm", "right_arm")
+    grid: list[dict[str, float]] = [
+        dict(zip(parts, s, strict=True)) for s in itertools.product((1.0, 1.3, 1.6), repeat=len(parts))
+    ]
     # spread over the grid, the middle one alone where only one is wanted
     return [grid[k] for k in np.linspace(0, len(grid) - 1, count + 2).astype(int)[1:-1]] if count < len(grid) else grid
 

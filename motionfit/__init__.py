@@ -8,7 +8,9 @@ mf.save("adapted.glb", fit.motion, mf.load_character("heavy.glb"))
 
 __version__ = "0.1.0"
 
-from motionfit import adapt, balance, dynamics, feet, ik, metrics, shape, terms
+from typing import TYPE_CHECKING
+
+from motionfit import balance, dynamics, feet, ik, metrics, shape, terms
 from motionfit import rotation as rotation
 from motionfit import splines as splines
 from motionfit._character import Character as Character
@@ -41,6 +43,13 @@ from motionfit.io import load_character as load_character
 from motionfit.io import load_motion as load_motion
 from motionfit.io import save as save
 from motionfit.metrics import measure as measure
+
+if TYPE_CHECKING:  # adapt is a module that can be called, which type checkers cannot know
+    from motionfit.adapt._verb import Adapt
+
+    adapt: Adapt
+else:
+    from motionfit import adapt
 
 __all__ = [
     "Block", "Character", "Control", "Correction", "Custom", "Drive", "During", "Energy", "Fit", "InputError",

@@ -130,7 +130,7 @@ class Correction(eqx.Module):
         partial = path.with_name(path.name + ".part")
         try:
             with open(partial, "wb") as file:
-                np.savez(file, **{k: np.asarray(v) for k, v in arrays.items()})
+                np.savez(file, **{k: np.asarray(v) for k, v in arrays.items()})  # pyright: ignore[reportArgumentType]: NumPy's stub
             partial.replace(path)
         except OSError as error:
             partial.unlink(missing_ok=True)

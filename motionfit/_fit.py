@@ -152,7 +152,7 @@ class _Rows(eqx.Module):
 
     objective: Objective
     fixed: Float[Array, "frames controls"]  # signals of all controls; the free columns are replaced
-    free: Int[Array, " free"]
+    free: Int[AnyArray, " free"]
     terms: tuple[int, ...] = eqx.field(static=True)
 
     @eqx.filter_jit  # traced once, however often a solver's program evaluates it
@@ -160,8 +160,7 @@ class _Rows(eqx.Module):
         (signals,) = x
         kin = self.objective.kinematics(self.fixed.at[:, self.free].set(signals))
         return tuple(
-            jnp.sqrt(self.objective.weights[k])
-            * self.objective.terms[k].residual(kin).reshape(signals.shape[0], -1)  # type: ignore
+            jnp.sqrt(self.objective.weights[k]) * self.objective.terms[k].residual(kin).reshape(signals.shape[0], -1)  # type: ignore
             for k in self.terms
         )
 
@@ -266,14 +265,14 @@ def solve_block(work: Work, solver, max_steps: int, adjoint: optx.AbstractAdjoin
         objective, controls, free, fixed = args
         kin = objective.kinematics(fixed.at[:, free].set(_signals(controls, x)))
         costs = tuple(w * term_cost(t, kin) for t, w in zip(objective.terms, objective.weights, strict=True))
-        return sum(costs), costs
+        return jnp.sum(jnp.stack(costs)), costs
 
     arguments = (work.objective, work.controls, jnp.asarray(work.free), work.objective.signals(work.points))
     options = {"max_steps": max_steps, "throw": False, "adjoint": adjoint, "has_aux": True}
     if isinstance(solver, optx.AbstractLeastSquaresSolver):
-        solution = optx.least_squares(residuals, _RemembersSquares(solver), work.start, arguments, **options)
+        solution = optx.least_squares(residuals, _RemembersSquares(inner=solver), work.start, arguments, **options)  # pyright: ignore[reportCallIssue]
     else:
-        solution = optx.minimise(energy, _RemembersMinimum(solver), work.start, arguments, **options)
+        solution = optx.minimise(energy, _RemembersMinimum(inner=solver), work.start, arguments, **options)  # pyright: ignore[reportCallIssue]
     return Solved(solution.value, solution.stats["start"], solution.aux,
                   solution.stats.get("accepted", solution.stats["num_steps"]),
                   solution.result == optx.RESULTS.successful)  # fmt: skip
@@ -298,7 +297,7 @@ def banded_solver(problem: Problem, block: Block) -> Banded | None:
     reaches = [problem.terms[k].reach for k in terms if isinstance(problem.terms[k], Term)]  # type: ignore
     if not same or any(r is None for r in reaches):
         return None
-    return Banded.of(bases[0], max(reaches, default=0), local=1)  # `solve_block` gives the frame-local rows first
+    return Banded.of(bases[0], max(reaches, default=0), local=1)  # `solve_block` gives the frame-local rows first  # pyright: ignore[reportArgumentType]
 
 
 # optimistix's default adjoint calls a system singular where a control cannot be observed (no frame in contact)
@@ -349,12 +348,12 @@ def _reach_errors(work: Work, reaches: tuple[int, ...], solver: Banded) -> tuple
 def check_reach(problem: Problem, block: Block, work: Work) -> None:
     """Find out a `Custom` term whose declared reach is wrong, before it quietly spoils every step of the solve."""
     names = tuple(problem.terms) if block.terms is None else block.terms
-    declared = [k for k in names if isinstance(problem.terms[k], Custom) and problem.terms[k].reach is not None]
+    declared = [k for k in names if isinstance(problem.terms[k], Custom) and problem.terms[k].reach is not None]  # pyright: ignore[reportAttributeAccessIssue]
     bases = [c.basis for c in problem.controls if c.name in block.controls]
     for name in declared:
         reach = problem.terms[name].reach  # type: ignore
         alone = work._replace(objective=problem.objective((name,)))
-        (error,) = _reach_errors(alone, (reach,), Banded.of(bases[0], reach))
+        (error,) = _reach_errors(alone, (reach,), Banded.of(bases[0], reach))  # pyright: ignore[reportArgumentType]
         if float(error) > 1e-3:
             raise InputError(f"term {name!r} says reach={reach}, but its rows depend on frames further away than that; "
                              "give mf.Custom(fn, args, reach=R) the R that it needs, or leave reach out")  # fmt: skip

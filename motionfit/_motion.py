@@ -134,7 +134,9 @@ class Kinematics(eqx.Module):
         M_j B_j^-1 of thesis (4.20)."""
         turn = rotation.multiply(self.rotations_world[:, joints], rotation.conjugate(self.rotations_bind[joints]))
         matrices = rotation.to_matrix(turn)
-        return matrices, self.positions_world[:, joints] - rotation.matrix_times(matrices, self.positions_bind[joints])
+        return matrices, jnp.asarray(self.positions_world)[:, joints] - rotation.matrix_times(
+            matrices, self.positions_bind[joints]
+        )
 
 
 def forward_kinematics(

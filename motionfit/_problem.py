@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jaxtyping import Float, PyTree
 
@@ -51,7 +50,7 @@ class Custom(Term):
 
     fn: Callable = eqx.field(static=True)
     args: PyTree = eqx.field(converter=lambda tree: jax.tree.map(_array, tree), default=None)
-    frames_around: int | None = eqx.field(static=True)
+    frames_around: int | None = eqx.field(static=True, default=None)
 
     def __init__(self, fn: Callable, args: PyTree = None, *, reach: int | None = None):
         if reach is not None and reach < 0:
@@ -108,7 +107,7 @@ class Robust(Term):
         scaled = self.term.residual(kin) / self.c
         # 2 (sqrt(1+s^2) - 1) = 2 s^2 / (sqrt(1+s^2) + 1): no cancellation for small s, and its root is
         # s * sqrt(2 / (...)), which keeps the sign and is smooth at zero
-        return self.c * scaled * jnp.sqrt(2.0 / (jnp.sqrt(1.0 + scaled * scaled) + 1.0))
+        return jnp.asarray(self.c) * scaled * jnp.sqrt(2.0 / (jnp.sqrt(1.0 + scaled * scaled) + 1.0))
 
 
 class Problem(eqx.Module):
@@ -157,20 +156,19 @@ class Problem(eqx.Module):
 
     def costs(self, correction: Correction | None = None) -> dict[str, float]:
         """The weighted cost of each term, 1/2 w sum r^2 or w E."""
-        points = tuple(jnp.asarray(p) for p in (correction or Correction.zero(self.controls)).points)
-        return {k: float(v) for k, v in zip(self.terms, _costs(self.objective(), points), strict=True)}
+        costs = _costs(self.objective(), self._points(correction))
+        return {k: float(v) for k, v in zip(self.terms, costs, strict=True)}
+
+    def _points(self, correction: Correction | None) -> tuple[Array, ...]:
+        return tuple(jnp.asarray(p) for p in (correction or Correction.zero(self.controls)).points)
 
     def report(self, correction: Correction | None = None) -> str:
         """A table of the terms: weight, cost and the frame where it is worst."""
-        kin = self.kinematics(None if correction is None else correction.signals())
         lines = [f"{'term':<28} {'weight':>9} {'cost':>12}  worst frame"]
-        costs = self.costs(correction)
-        for name, term in self.terms.items():
-            worst = "-"
-            if isinstance(term, Term):
-                rows = np.asarray(term.residual(kin))
-                worst = str(int(np.square(rows.reshape(len(rows), -1)).sum(-1).argmax()))
-            lines.append(f"{name:<28} {float(self.weights[name]):>9.3g} {costs[name]:>12.5g}  {worst}")
+        costs, frames = self.costs(correction), _worst_frames(self.objective(), self._points(correction))
+        for (name, cost), frame in zip(costs.items(), frames, strict=True):
+            worst = "-" if frame is None else str(int(frame))
+            lines.append(f"{name:<28} {float(self.weights[name]):>9.3g} {cost:>12.5g}  {worst}")
         return "\n".join(lines)
 
 
@@ -202,12 +200,26 @@ class Objective(eqx.Module):
     def costs(self, points: tuple[Float[AnyArray, " _"], ...]) -> tuple[Float[Array, ""], ...]:
         """1/2 w sum r^2 or w E of each term: the cost convention of _types.py."""
         kin = self.kinematics(self.signals(points))
-        return tuple(w * term_cost(t, kin) for t, w in zip(self.terms, self.weights, strict=True))
+        return tuple(jnp.asarray(w) * term_cost(t, kin) for t, w in zip(self.terms, self.weights, strict=True))
 
 
 @eqx.filter_jit
 def _costs(objective: Objective, points) -> tuple[Array, ...]:
     return objective.costs(points)
+
+
+@eqx.filter_jit  # one program: op by op, a first report compiled some hundred and fifty
+def _worst_frames(objective: Objective, points) -> tuple[Array | None, ...]:
+    """The frame in which the residuals of each term are largest; None for an energy."""
+    kin = objective.kinematics(objective.signals(points))
+
+    def worst(term: Term | Energy) -> Array | None:
+        if isinstance(term, Energy):
+            return None
+        rows = term.residual(kin)
+        return jnp.argmax(jnp.sum(jnp.square(rows.reshape(rows.shape[0], -1)), axis=1))
+
+    return tuple(worst(term) for term in objective.terms)
 
 
 def term_cost(term: Term | Energy, kin: Kinematics) -> Float[Array, ""]:

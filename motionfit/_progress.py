@@ -14,10 +14,10 @@ class Progress:
 
     def task(self, name: str, total: int | None = None):
         """Start a task; the returned function takes (done, total)."""
-        if self.bar is None:
+        if (bar := self.bar) is None:
             return lambda done, total: None
-        task = self.tasks[name] = self.bar.add_task(name, total=total)
-        return lambda done, total: self.bar.update(task, completed=done, total=total)
+        task = self.tasks[name] = bar.add_task(name, total=total)
+        return lambda done, total: bar.update(task, completed=done, total=total)
 
     def done(self, name: str) -> None:
         if self.bar is not None and name in self.tasks:

@@ -1,6 +1,7 @@
 """The static tree of joints, and the roles by which every algorithm finds them."""
 
 import json
+import os
 import pathlib
 import re
 from collections.abc import Mapping, Sequence
@@ -136,7 +137,7 @@ def _depth(parents: Sequence[int], joint: int) -> int:
     return depth
 
 
-def load_role_mapping(path: str | pathlib.Path) -> dict[str, str]:
+def load_role_mapping(path: str | os.PathLike) -> dict[str, str]:
     """A JSON file {"left_upper_arm": "JointName", ...} that overrides the recognised roles."""
     try:
         mapping = json.loads(pathlib.Path(path).read_text(encoding="utf-8"))

@@ -112,7 +112,9 @@ class Banded(lx.AbstractLinearSolver):
     def times(self, columns: tuple[Array, ...], x: tuple[Array, ...]) -> tuple[Array, ...]:
         """The product of such a Jacobian with control points."""
         order = np.arange(self.width, dtype=np.int32) - jnp.asarray(self.first)[:, None]
-        own = jnp.stack(x, axis=0)[:, jnp.asarray(self.first)[:, None] + order % self.width]  # (controls, frames, width)
+        own = jnp.stack(x, axis=0)[
+            :, jnp.asarray(self.first)[:, None] + order % self.width
+        ]  # (controls, frames, width)
         own = jnp.moveaxis(own, 2, 1).reshape(-1, own.shape[1])
         return jax.tree.map(lambda c: jnp.einsum("kt,ktn->tn", own, c), columns)
 

@@ -9,9 +9,13 @@ import os
 import pathlib
 import sys
 import time
-from typing import Annotated
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from motionfit._fit import BlockReport
 
 DEFAULT_BLOCKS = "arms,legs,footskate,balance"  # motionfit.adapt.DEFAULT, which takes seconds to import
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False,
@@ -243,7 +247,7 @@ def run_adapt(
         raise typer.Exit(3)
 
 
-def _times(history) -> dict[str, float]:
+def _times(history: Iterable["BlockReport"]) -> dict[str, float]:
     """Seconds per entry of --blocks: both arms are one of them, and both forearms."""
     seconds: dict[str, float] = {}
     for report in history:
@@ -276,9 +280,9 @@ class _CompileClock:
         self.seconds = 0.0
         jax.monitoring.register_event_duration_secs_listener(self._listen)
 
-    def _listen(self, event: str, duration: float, **_) -> None:
+    def _listen(self, event: str, duration_secs: float, **_) -> None:
         if event.startswith("/jax/core/compile/"):
-            self.seconds += duration
+            self.seconds += duration_secs
 
 
 def _measure_all(body, motions: dict, source, clip, reference, progress) -> dict[str, dict]:
@@ -306,8 +310,9 @@ def _measure_all(body, motions: dict, source, clip, reference, progress) -> dict
             result[name] = json.loads(json.dumps({k: v for k, v in result[same].items() if k != "_excess"}))
         else:
             skin = skin_depths(body, motion, step=step, progress=progress.task(f"skin {name}"))
+            standing = measure_standing(body, motion, stance)
             result[name] = measure(motion, source, volume_excess=excess, skin=skin, reference=own,
-                                   **measure_standing(body, motion, stance))  # fmt: skip
+                                   feet=standing["feet"], balance=standing["balance"])  # fmt: skip
         result[name]["_excess"] = excess
     return result
 
@@ -341,7 +346,7 @@ def _print_table(columns: dict[str, dict]) -> None:
     def line(label: str, *path: str, scale: float | int = 1, form: str = "{:.1f}") -> None:
         cells = []
         for m in columns.values():
-            value = m
+            value: Any = m
             for key in path:
                 value = value.get(key) if isinstance(value, dict) else None
             cells.append("-" if value is None else form.format(scale * value))

@@ -42,7 +42,7 @@ def multiply(a: Float[AnyArray, "... 4"], b: Float[AnyArray, "... 4"]) -> Float[
 
 def conjugate(q: Float[AnyArray, "... 4"]) -> Float[Array, "... 4"]:
     """The inverse of a unit quaternion."""
-    return q * jnp.array([1.0, -1.0, -1.0, -1.0], dtype=jnp.result_type(q))
+    return jnp.asarray(q) * jnp.array([1.0, -1.0, -1.0, -1.0], dtype=jnp.result_type(q))
 
 
 def rotate(q: Float[AnyArray, "... 4"], v: Float[AnyArray, "... 3"]) -> Float[Array, "... 3"]:
@@ -118,4 +118,5 @@ def to_matrix(q: Float[AnyArray, "... 4"]) -> Float[Array, "... 3 3"]:
 
 def matrix_times(m: Float[AnyArray, "... 3 3"], v: Float[AnyArray, "... 3"]) -> Float[Array, "... 3"]:
     """The vectors v turned by the matrices m; written out, since sums over an axis of three are slow on the CPU."""
+    m, v = jnp.asarray(m), jnp.asarray(v)
     return m[..., 0] * v[..., 0, None] + m[..., 1] * v[..., 1, None] + m[..., 2] * v[..., 2, None]

@@ -15,7 +15,7 @@ def random_motion(seed: int, joints: int, frames: int, rate: float = 60.0) -> Mo
     parents = [-1] + [int(rng.integers(0, j)) for j in range(1, joints)]
 
     def turns(*shape):
-        flat = Rotation.random(int(np.prod(shape)), random_state=rng).as_quat(scalar_first=True)
+        flat = Rotation.random(int(np.prod(shape)), random_state=rng).as_quat(scalar_first=True)  # pyright: ignore[reportCallIssue]: the name before SciPy 1.15
         return flat.reshape(*shape, 4)
 
     skeleton = Skeleton([f"joint{j}" for j in range(joints)], parents, rng.normal(size=(joints, 3)), turns(joints))

@@ -33,7 +33,7 @@ def test_heavy_body_comes_clean_and_stays_itself(fitted, heavy, average):
     assert inside <= inside_reference + 0.002
     assert fitted.status == "converged"
     assert np.maximum(fitted.details["excess_after_m"], 0).max() < 0.01
-    assert derivative_ratio(fitted.motion, fitted.base, 3) <= 1.05
+    assert (derivative_ratio(fitted.motion, fitted.base, 3) or 9.0) <= 1.05
     assert joint_angles(fitted.motion, fitted.base).mean() < np.deg2rad(3)
     driven = {int(d.joint) for c in fitted.correction.controls for d in c.drives}
     still = [j for j in range(31) if j not in driven]

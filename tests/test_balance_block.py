@@ -43,7 +43,7 @@ def test_a_leaning_walk_is_brought_back(leaning, average):
     feet = [average.skeleton.joint(f"{s}_{r}") for s in ("left", "right") for r in ("foot", "toe")]
     before, after = (host_kinematics(m)[0] for m in (bent, fit.motion))
     assert np.abs(after[:, feet] - before[:, feet]).max() < PLANTED
-    assert derivative_ratio(fit.motion, bent, 3) <= 1.05
+    assert (derivative_ratio(fit.motion, bent, 3) or 9.0) <= 1.05
     # the correction alone gives the motion again
     again = fit.correction.apply(fit.base)
     np.testing.assert_allclose(joint_angles(again, fit.motion), 0.0, atol=1e-7)

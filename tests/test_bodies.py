@@ -38,8 +38,9 @@ def test_girths(name):
     mesh = trimesh.Trimesh(body.skin.vertices_bind, body.skin.faces, process=False)
 
     def girth(origin, normal):
-        loops = mesh.section(plane_origin=origin, plane_normal=normal).discrete
-        nearest = min(loops, key=lambda loop: np.linalg.norm(loop.mean(0) - origin))
+        section = mesh.section(plane_origin=origin, plane_normal=normal)
+        assert section is not None
+        nearest = min(section.discrete, key=lambda loop: np.linalg.norm(loop.mean(0) - origin))
         return np.linalg.norm(np.diff(nearest, axis=0), axis=1).sum()
 
     def along(a, b, t):

@@ -58,7 +58,9 @@ def _run(monkeypatch, capsys, *arguments) -> tuple[int, str]:
     monkeypatch.setattr(sys, "argv", ["motionfit", *map(str, arguments)])
     with pytest.raises(SystemExit) as exit_:
         main()
-    return exit_.value.code, capsys.readouterr().err
+    code = exit_.value.code
+    assert isinstance(code, int)
+    return code, capsys.readouterr().err
 
 
 def _refused(monkeypatch, capsys, tmp_path, clip, body, fact, *more):

@@ -65,6 +65,7 @@ def test_round_trip_of_random_skeletons(tmp_path_factory, seed, order, joints, f
     again = read_bvh(path, unit=1.0, up="y", rest_frame="none")
     assert float(again.dt) == frame_time
     order_of = [again.skeleton.names.index(n) for n in skeleton.names]
+    assert again.skeleton.channels is not None
     assert [again.skeleton.channels[i] for i in order_of] == list(channels)
     back = mf.Motion(skeleton, again.root, again.rotations[:, order_of], again.dt)
     assert joint_angles(back, motion).max() < ANGLE

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import motionfit as mf
 from motionfit import samples
+from motionfit._character import PARTS
 from motionfit._control import Control, Correction, Drive
 from motionfit._fit import block_adjoint, block_solver, block_work, solve_block
 from motionfit._motion import Motion, host_kinematics, rest_motion
@@ -67,7 +68,7 @@ def test_a_clip_without_collisions_comes_back(sunk, average):
 def test_a_sphere_is_its_centre_deeper_by_its_radius(average):
     motion = rest_motion(average.skeleton)
     # near the surface the field is a distance; far away it counts the way to its grid
-    vertex = int(np.flatnonzero(average.part_of_vertex == mf._character.PARTS.index("torso"))[0])
+    vertex = int(np.flatnonzero(average.part_of_vertex == PARTS.index("torso"))[0])
     small, big = (known_depths(average, (Group("x", (Sphere("hips", radius=r, vertex=vertex),), ("torso",), ()),))
                   for r in (0.0, 0.03))  # fmt: skip
     np.testing.assert_allclose(big.depths(motion) - small.depths(motion), 0.03, atol=1e-9)
@@ -178,14 +179,14 @@ def test_forearms_point_where_they_did(heavy, average):
     arms = mf.adapt(walk, heavy, reference=average, blocks=("arms",))
     fit = mf.adapt.forearm(walk, heavy, arms, reference=average, hand=True)
     before, after = (mf.metrics.forearm_direction(f.motion, arms.base) for f in (arms, fit))
-    assert after < 0.5 * before
+    assert before is not None and after is not None and after < 0.5 * before
     limit = np.maximum(arms.details["excess_after_m"], 0).max()
     pairs = tuple(p for p in mf.shape.PAIRS if p.name in arms.details["pairs"])
     own, _ = mf.adapt.reference_depths(walk, heavy, average, pairs)
     depths = mf.adapt.volume_depths(mf.adapt.build_clearance(heavy, pairs), fit.motion) - own
     keep = [k for k, p in enumerate(pairs) if not p.first.endswith("upper_arm")]
     assert depths[:, keep].max() <= max(limit, 0.01)
-    assert mf.metrics.derivative_ratio(fit.motion, arms.base, 3) <= 1.05
+    assert (mf.metrics.derivative_ratio(fit.motion, arms.base, 3) or 9.0) <= 1.05
     hands = [heavy.skeleton.joint(f"{s}_hand") for s in ("left", "right")]
     turned = [host_kinematics(m)[1][:, hands] for m in (arms.base, fit.motion)]
     np.testing.assert_allclose(np.abs((turned[0] * turned[1]).sum(-1)), 1.0, atol=1e-9)

@@ -125,6 +125,21 @@ def test_new_numbers_do_not_recompile(still):
     assert first > 0 and len(traces) == first
 
 
+def test_the_report_names_the_worst_frame(still):
+    character, motion = still
+    control = _control(character, motion, "left_upper_arm")
+    goal = np.ones((20, 1))
+    goal[7], goal[3] = 2.0, -1.0
+    terms = {"peak": mf.Custom(lambda kin, goal: kin.signals - goal, goal, reach=0),
+             "style": mf.Energy(lambda kin, goal: jnp.sum((kin.signals - goal) ** 2), 0.2)}  # fmt: skip
+    problem = mf.Problem(character, motion, terms, (control,))
+    ahead = mf.Correction((control,), (jnp.full(control.basis.count, 3.0),))
+    for correction, frame in ((None, "7"), (ahead, "3")):
+        rows = [line.split() for line in problem.report(correction).splitlines()[1:]]
+        assert [(r[0], r[-1]) for r in rows] == [("peak", frame), ("style", "-")]
+        np.testing.assert_allclose([float(r[2]) for r in rows], list(problem.costs(correction).values()), rtol=1e-4)
+
+
 def test_corrections_save_and_apply_to_the_same_bits(still, tmp_path):
     character, motion = still
     control = _control(character, motion, "left_upper_arm")

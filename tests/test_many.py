@@ -1,5 +1,7 @@
 """One clip on many bodies."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ import motionfit as mf
 from motionfit import samples
 
 pytestmark = pytest.mark.slow
-ARMS = {"blocks": ("arms",)}
+ARMS: dict[str, Any] = {"blocks": ("arms",)}
 
 
 @pytest.fixture(scope="module")

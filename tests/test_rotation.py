@@ -16,7 +16,7 @@ EXACT = 1e-12  # algebra in double precision
 @given(st.integers(0, 2**31))
 def test_group_operations_agree_with_scipy(seed):
     rng = np.random.default_rng(seed)
-    a, b = (Rotation.random(5, random_state=rng) for _ in range(2))
+    a, b = (Rotation.random(5, random_state=rng) for _ in range(2))  # pyright: ignore[reportCallIssue]: the name before SciPy 1.15
     qa, qb, v = a.as_quat(scalar_first=True), b.as_quat(scalar_first=True), rng.normal(size=(5, 3))
     np.testing.assert_allclose(rotation.rotate(qa, v), a.apply(v), atol=EXACT)
     product = Rotation.from_quat(np.asarray(rotation.multiply(qa, qb)), scalar_first=True)

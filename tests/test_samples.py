@@ -70,6 +70,7 @@ def test_the_script_reproduces_the_figures(shared_data):
 
     path = pathlib.Path(__file__).parents[1] / "scripts" / "fit_walk.py"
     spec = importlib.util.spec_from_file_location("fit_walk", path)
+    assert spec is not None and spec.loader is not None
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
     from motionfit._walk_harmonics import HARMONICS

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import motionfit as mf
 from motionfit import samples
+from motionfit._character import PARTS
 from motionfit._motion import bind_pose
 from motionfit.shape import grow, parse_girth
 from motionfit.shape.distance import capsule_depth, closest_on_lines, cylinder_depth, segment_distance
@@ -58,6 +59,7 @@ def _tube(radius: float, length: float, sections: int = 64) -> mf.Character:
     """A cylinder along y bound to a forearm on a person's arm joint names."""
     mesh = trimesh.creation.cylinder(radius, length, sections=sections)
     mesh = mesh.subdivide_to_size(0.05)
+    assert isinstance(mesh, trimesh.Trimesh)
     side = np.abs(mesh.face_normals[:, 2]) < 0.5
     mesh.update_faces(side)
     mesh.remove_unreferenced_vertices()
@@ -103,11 +105,11 @@ def test_a_field_moves_with_its_part(heavy, rng):
     rotations = np.array(still.rotations)
     rotations[0, 0] = (turn * Rotation.from_quat(rotations[0, 0], scalar_first=True)).as_quat(scalar_first=True)
     moved = mf.Motion(heavy.skeleton, turn.apply(np.asarray(still.root)) + shift, rotations, still.dt)
-    depths = [
+    before, after = (
         field.depth(mf.forward_kinematics(heavy.skeleton, m), p.T[None])
         for m, p in ((still, points), (moved, turn.apply(points) + shift))
-    ]
-    np.testing.assert_allclose(*depths, atol=1e-9)
+    )
+    np.testing.assert_allclose(before, after, atol=1e-9)
 
 
 def test_lookups_have_the_gradient_that_differences_show(heavy, rng):
@@ -129,7 +131,7 @@ def test_lookups_have_the_gradient_that_differences_show(heavy, rng):
 
 def test_probes_are_skinned_vertices(heavy):
     walk = mf.onto(samples.walk(cycles=1), heavy.skeleton)[::20]
-    mine = np.flatnonzero(heavy.part_of_vertex == mf._character.PARTS.index("left_upper_arm"))[::7]
+    mine = np.flatnonzero(heavy.part_of_vertex == PARTS.index("left_upper_arm"))[::7]
     kin = mf.forward_kinematics(heavy.skeleton, walk)
     exact = mf.skin(heavy.skin, kin)[0][:, mine]
     told = jnp.moveaxis(make_probes(heavy, "left_upper_arm", mine).positions_world(kin), 1, -1)
@@ -150,12 +152,12 @@ def test_growth_scales_across_the_bone_and_only_there(average):
     elbow, wrist = (positions[average.skeleton.joint(f"left_{r}")] for r in ("forearm", "hand"))
     axis = (wrist - elbow) / np.linalg.norm(wrist - elbow)
     along = (average.skin.vertices_bind - elbow) @ axis
-    mine = average.part_of_vertex == mf._character.PARTS.index("left_forearm")
+    mine = average.part_of_vertex == PARTS.index("left_forearm")
     middle = mine & (along > 0.09) & (along < 0.15)
     offset = average.skin.vertices_bind[middle] - elbow
     across = offset - (offset @ axis)[:, None] * axis
     np.testing.assert_allclose(moved[middle], 0.5 * across, atol=2e-3)
-    right = average.part_of_vertex == mf._character.PARTS.index("right_forearm")
+    right = average.part_of_vertex == PARTS.index("right_forearm")
     assert np.abs(moved[right]).max() == 0.0
 
 

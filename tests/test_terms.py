@@ -81,12 +81,15 @@ def test_contract(cases, heavy, name, pose):
     rng = np.random.default_rng(3)
     start = rng.normal(size=sum(sizes)) * 0.003
 
+    term = problem.terms["term"]
+    assert isinstance(term, mf.Term)
+
     def cost(x):
         parts = jnp.split(jnp.asarray(x), np.cumsum(sizes)[:-1])
         signals = jnp.stack([c.signal(p) for c, p in zip(problem.controls, parts, strict=True)], axis=1)
-        return 0.5 * jnp.sum(problem.terms["term"].residual(problem.kinematics(signals)) ** 2)
+        return 0.5 * jnp.sum(term.residual(problem.kinematics(signals)) ** 2)
 
-    rows = problem.terms["term"].residual(problem.kinematics(jnp.zeros((motion.frame_count, 3))))
+    rows = term.residual(problem.kinematics(jnp.zeros((motion.frame_count, 3))))
     assert rows.shape[0] == motion.frame_count and np.isfinite(rows).all()
     cost = jax.jit(cost)
     for x in (np.zeros_like(start), start):

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from motionfit._character import PARTS, Character
 from motionfit._motion import Kinematics, Motion, forward_kinematics
 from motionfit._skeleton import SIDES
-from motionfit._types import InputError
+from motionfit._types import AnyArray, InputError
 from motionfit.shape.field import (
     Probes,
     fit_field,
@@ -168,7 +168,7 @@ def over_time(look, term: Term, motion: Motion, allowed: Float[np.ndarray, "fram
 
 
 @eqx.filter_jit
-def _look(look, term: Term, motion: Motion, allowed: Float[Array, "frames rows"] | None):
+def _look(look, term: Term, motion: Motion, allowed: Float[AnyArray, "frames rows"] | None):
     return look(term, forward_kinematics(motion.skeleton, motion), allowed)
 
 
@@ -221,16 +221,16 @@ def reduced(
     `counts` says how many by kind of part.
     """
     term, joined, rows = clearance.term, [], []
-    for k in range(len(term.fields)):
-        sets = [i for i, owner in enumerate(term.field_of) if owner == k]
+    for k in range(len(term.fields)):  # pyright: ignore[reportAttributeAccessIssue]
+        sets = [i for i, owner in enumerate(term.field_of) if owner == k]  # pyright: ignore[reportAttributeAccessIssue]
         kept = []
         for i in sets:
             count = counts[_kind(clearance.part_of_set[i])]
             kept.append(np.sort(np.argsort(-score[i])[:count]))
-        joined.append(Probes.joined([term.probes[i][some] for i, some in zip(sets, kept, strict=True)]))
+        joined.append(Probes.joined([term.probes[i][some] for i, some in zip(sets, kept, strict=True)]))  # pyright: ignore[reportAttributeAccessIssue]
         columns = np.repeat([clearance.pair_of_row[i] for i in sets], [len(some) for some in kept])
         rows.append(allowed[:, columns])
-    return SkinClearance(tuple(joined), term.fields, tuple(range(len(joined))), tuple(rows), term.sigma, term.width)
+    return SkinClearance(tuple(joined), term.fields, tuple(range(len(joined))), tuple(rows), term.sigma, term.width)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def allowance(

@@ -201,8 +201,8 @@ def _solve(
     seen = dataclasses.replace(motion[at.rows], dt=np.asarray(at.dt))
     smooth, history = jerk_scale(motion), []
     tries = [(_faults(worst, np.where(touching, -before - TOUCH, 0.0)), so_far, before)]
-    by_field = [[i for i, owner in enumerate(known.clearance.term.field_of) if owner == k]
-                for k in range(len(known.clearance.term.fields))]  # fmt: skip
+    by_field = [[i for i, owner in enumerate(known.clearance.term.field_of) if owner == k]  # pyright: ignore[reportAttributeAccessIssue]
+                for k in range(len(known.clearance.term.fields))]  # fmt: skip  # pyright: ignore[reportAttributeAccessIssue]
     for _ in range(ROUNDS):
         smoothed = smooth_floor(allowed, at.dt) - known.radius
         clear = reduced(known.clearance, score, filled(smoothed, at, 1e3), PROBES)

@@ -78,7 +78,7 @@ def footskate(
         "nothing_to_do" if motion is so_far.motion and not shift.any() else "max_steps" if more.any() else "converged"
     )
     report = BlockReport("footskate", 0, status, rounds, *(sum(c.values()) for c in costs), *costs,
-                         time.perf_counter() - started)  # fmt: skip
+                         time.perf_counter() - started)  # fmt: skip  # pyright: ignore[reportCallIssue]
     result = _moved(motion, shift) if shift.any() else motion
     return dataclasses.replace(so_far, motion=result, history=(*so_far.history, report))
 

@@ -143,7 +143,7 @@ def limbs(
     def told(round_: int):
         if progress is None:
             return None
-        return lambda name, done, _: progress(name, round_ * steps + done, ROUNDS * steps)
+        return lambda name, done, _: progress(name, round_ * steps + done, ROUNDS * steps)  # pyright: ignore[reportOptionalCall]
 
     for round_ in range(ROUNDS):
         problem = _problem(character, seen, stages, beyond, smooth, (small, moved))
@@ -186,7 +186,7 @@ def limbs(
     status = "violations_left" if best.left > TOLERANCE else "converged"
     details = {"pairs": [p.name for p in pairs], "frames": seen.frames, "excess_before_m": excess,
                "excess_after_m": best.depths - own, "held_back_m": best.held_back}  # fmt: skip
-    return Fit(final, final.apply(base), base, status, tuple(history), best.problem, details)
+    return Fit(final, final.apply(base), base, status, tuple(history), best.problem, details)  # pyright: ignore[reportArgumentType]
 
 
 def _check_start(start: Fit, seen: Seen, pairs: tuple[Pair, ...]) -> None:
@@ -201,7 +201,7 @@ def _filled(points, count: int) -> Float[np.ndarray, " count"]:
     return np.concatenate([np.asarray(points, float), np.zeros(count - len(points))])
 
 
-def _side_by_side(stages: list[Stage]) -> list[Block | tuple[Block, ...]]:
+def _side_by_side(stages: list[Stage]) -> Sequence[Block | tuple[Block, ...]]:
     """The legs do not look at the arms, so they go with the first one. The other arm shares its program, and waits."""
     blocks = [s.block for s in stages]
     legs = tuple(b for b in blocks if b.name == "legs")
@@ -275,7 +275,7 @@ def _problem(
         name = f"{stage.block.name}_clearance"
         if stage.clearance.part_of_set:
             score = sum(support(stage.clearance, motion, stage.allowed) for motion in motions)
-            terms[name] = reduced(stage.clearance, score, limit, SOLVE_PROBES)
+            terms[name] = reduced(stage.clearance, score, limit, SOLVE_PROBES)  # pyright: ignore[reportArgumentType]
         else:
             terms[name] = stage.clearance.allowing(limit)
     frames = np.arange(length)

@@ -101,7 +101,7 @@ class SkinLooks:
         self, seen: Float[np.ndarray, "looks pairs"], motion: Motion, share: float = NEARLY
     ) -> Bool[np.ndarray, " pairs"]:
         """The pairs that show no more than a share of the tolerance in any look at `motion`, of the solver's frames."""
-        return (seen <= self._passes(self.own, motion) + share * TOLERANCE).all(axis=0)
+        return (seen <= self._passes(self.own, motion) + share * TOLERANCE).all(axis=0)  # pyright: ignore[reportReturnType]
 
     def _passes(self, own: Float[np.ndarray, "looks pairs"], motion: Motion) -> Float[np.ndarray, "looks pairs"]:
         """The depth [m] that is none of the body's shape: what the reference shows in the frame or, within limits,

@@ -126,7 +126,7 @@ def _spline_through(
     knots = np.arange(-DEGREE, spans + DEGREE + 1) * every
     rows = csr_array(BSpline.design_matrix(np.arange(frames, dtype=float), knots, DEGREE))
     count = spans + DEGREE
-    change = diags_array([-1.0, 1.0], offsets=[0, 1], shape=(count - 1, count))
+    change = diags_array([-1.0, 1.0], offsets=[0, 1], shape=(count - 1, count))  # pyright: ignore[reportArgumentType]: SciPy's stub
     # the trace of weight keeps the system regular where nothing counts at all
     normal = rows.T @ diags_array(weights.sum(1) + 1e-9) @ rows + LEVEL * change.T @ change
     target = rows.T @ (weights[..., None] * values).sum(1)

@@ -126,7 +126,7 @@ def _clearing(
         return needed
     width = 2 * max(1, round(0.5 * EASE / dt)) + 1
     raised = smooth(smooth(maximum_filter1d(needed, 2 * width - 1, mode="nearest"), width), width)
-    near = distance_transform_edt(~planted) if planted.any() else np.full(len(planted), np.inf)
+    near = np.asarray(distance_transform_edt(~planted)) if planted.any() else np.full(len(planted), np.inf)
     s = np.clip(near * dt / EASE, 0.0, 1.0)
     return raised * (3 * s**2 - 2 * s**3)
 

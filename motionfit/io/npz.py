@@ -32,7 +32,7 @@ def write_npz(path: str | os.PathLike, motion: Motion) -> None:
     if motion.translations is not None:
         arrays["translations"] = motion.translations
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **{k: np.asarray(v) for k, v in arrays.items()})
+    np.savez_compressed(buffer, **{k: np.asarray(v) for k, v in arrays.items()})  # pyright: ignore[reportArgumentType]: NumPy's stub
     write_bytes(path, buffer.getvalue())
 
 

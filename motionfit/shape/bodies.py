@@ -415,7 +415,7 @@ def _mesh(shape: BodyShape) -> tuple[np.ndarray, np.ndarray]:
     step = 1e-4
     for round_ in range(4):
         if round_ < 3:
-            vertices = vertices + 0.5 * (laplacian.dot(vertices) - vertices)
+            vertices = vertices + 0.5 * (laplacian.dot(vertices) - vertices)  # pyright: ignore[reportOptionalMemberAccess]: trimesh's stub
         around = np.concatenate([vertices, *(vertices + step * np.eye(3)[i] for i in range(3))])
         value = _fields(shape, around).total(shape.stature).reshape(4, -1)
         gradient = ((value[1:] - value[0]) / step).T

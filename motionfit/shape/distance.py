@@ -72,7 +72,7 @@ def capsule_depth(
 ) -> Float[Array, "..."]:  # fmt: skip
     """Penetration depth [m] of two capsules (negative: the gap): sum of the radii less the axes' distance."""
     distance, _, _ = segment_distance(p0, p1, q0, q1)
-    return p_radius + q_radius - distance
+    return jnp.asarray(p_radius) + q_radius - distance
 
 
 def cylinder_depth(

@@ -6,6 +6,7 @@ a grid in the bind frame, once per body. A lookup costs a few nanoseconds and ha
 winding numbers of the mesh have none.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -111,7 +112,7 @@ class _Meeting(eqx.Module):
         idle = np.array([[0.0, 1.0]])
         takeover = [jnp.concatenate([jnp.asarray(f.takeover), *[idle] * (joins - len(f.takeover))]) for f in fields]
         sizes = [f.coefficients.shape for f in fields]
-        starts = np.cumsum([0, *(np.prod(s) for s in sizes)])[:-1].astype(np.int32)
+        starts = np.cumsum([0, *(math.prod(s) for s in sizes)])[:-1].astype(np.int32)
         tables = [
             jnp.concatenate([jnp.asarray(f.coefficients)[None], jnp.asarray(f.pulls)]).reshape(3, -1) for f in fields
         ]
@@ -334,8 +335,8 @@ def standing(skeleton: Skeleton, swing: float = 0.0, out: float = 0.035) -> Moti
         down = np.array([sign * np.sin(out), -np.cos(out) * np.cos(swing), np.cos(out) * np.sin(swing)])
         for joint, end in ((arm, elbow), (elbow, hand)):
             bone = positions[end] - positions[joint]
-            laid, _ = Rotation.align_vectors(down[None], (bone / np.linalg.norm(bone))[None])
-            turned[joint] = laid * Rotation.from_quat(world[joint], scalar_first=True)
+            laid, _ = Rotation.align_vectors(down[None], (bone / np.linalg.norm(bone))[None])  # pyright: ignore[reportAssignmentType]
+            turned[joint] = laid * Rotation.from_quat(world[joint], scalar_first=True)  # pyright: ignore[reportArgumentType]
     for joint in sorted(turned):
         above, path = Rotation.identity(), []
         parent = skeleton.parents[joint]

@@ -119,7 +119,7 @@ class Volumes(eqx.Module):
     ) -> tuple[Float[Array, "frames segments 3"], Float[Array, "frames segments 3"]]:
         """World start and end of every axis [m]."""
         joints = np.array(self.joints)
-        turn, origin = kin.rotations_world[:, joints], kin.positions_world[:, joints]
+        turn, origin = kin.rotations_world[:, joints], jnp.asarray(kin.positions_world)[:, joints]
         start = rotation.rotate(turn, jnp.asarray(self.start)[None])
         return origin + start, origin + rotation.rotate(turn, jnp.asarray(self.end)[None])
 

@@ -26,7 +26,7 @@ class Effort(Term):
     sigma: Float[AnyArray, "*controls"] = eqx.field(converter=_array, default=1.0)
 
     def residual(self, kin: Kinematics) -> Float[Array, "frames controls"]:
-        return kin.signals / self.sigma
+        return jnp.asarray(kin.signals) / self.sigma
 
 
 class Smoothness(Term):
@@ -73,7 +73,9 @@ class JointTracking(Term):
     sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.01)
 
     def residual(self, kin: Kinematics) -> Float[Array, "frames tracked 3"]:
-        return (kin.positions_world[:, np.array(self.joints)] - jnp.asarray(self.target_world)) / self.sigma
+        return (
+            jnp.asarray(kin.positions_world)[:, np.array(self.joints)] - jnp.asarray(self.target_world)
+        ) / self.sigma
 
 
 class RotationTracking(Term):

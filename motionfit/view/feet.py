@@ -21,12 +21,9 @@ SIDES = (("left", "#4477aa"), ("right", "#cc6677"))
 
 def _save(path: str | os.PathLike, size: tuple[float | int, float | int], draw: Callable) -> None:
     """Draw a figure without a display and write it whole or not at all."""
-    import matplotlib
+    from matplotlib.figure import Figure  # not pyplot: that would need a backend, and a notebook has chosen its own
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure = plt.figure(figsize=size, constrained_layout=True)
+    figure = Figure(figsize=size, layout="constrained")
     path = pathlib.Path(path)
     partial = path.with_name(path.name + ".part")
     try:
@@ -36,8 +33,6 @@ def _save(path: str | os.PathLike, size: tuple[float | int, float | int], draw: 
     except OSError as error:
         partial.unlink(missing_ok=True)
         raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another path") from None
-    finally:
-        plt.close(figure)
 
 
 def _outline(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "corners 2"]:

@@ -41,7 +41,9 @@ def draw_body(
     base = SKIN[None] if colors is None else colors[faces[order]].mean(1)
     shaded = np.clip(light[:, None] * base, 0, 1)
     outline = corners[order][:, :, :2] + [shift, 0.0]
-    axes.add_collection(PolyCollection(outline, facecolors=shaded, edgecolors="face", linewidths=0.25, alpha=alpha))
+    # an array is drawn without a copy, which matplotlib's stub does not know
+    faced = PolyCollection(outline, facecolors=shaded, edgecolors="face", linewidths=0.25, alpha=alpha)  # pyright: ignore[reportArgumentType]
+    axes.add_collection(faced)
 
 
 def report_picture(
@@ -58,15 +60,12 @@ def report_picture(
 
     The moments are the worst frame before, and the worst of the thirds of the clip that it does not lie in.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure  # not pyplot: that would need a backend, and a notebook has chosen its own
 
     moments = _moments(excess_before)
     shown = [k for k in range(len(pairs)) if max(excess_before[:, k].max(), excess_after[:, k].max()) > 1e-3]
     shown = sorted(shown, key=lambda k: -excess_before[:, k].max())[:9]
-    figure = plt.figure(figsize=(15, 10.5), constrained_layout=True)
+    figure = Figure(figsize=(15, 10.5), layout="constrained")
     grid = figure.add_gridspec(2, 1, height_ratios=[1.35, 1.0])
     bodies = grid[0].subgridspec(1, 2)
     for column, (name, motion, excess) in enumerate(
@@ -96,8 +95,6 @@ def report_picture(
     except OSError as error:
         partial.unlink(missing_ok=True)
         raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
-    finally:
-        plt.close(figure)
 
 
 def _moments(excess: np.ndarray) -> list[int]:
