@@ -70,7 +70,8 @@ def girth_derivative(
     `grow(fit.problem.character, {"trunk": scale})` takes, at scale 1. With `of_reference` it is the reference that
     grows, and with it the overlap that does not count. Blocks after the limbs are not looked through.
 
-    The fit is first solved on to `tolerance`, relative and absolute. `motionfit.adapt.predict` takes a step.
+    The fit is first solved on to `tolerance`, relative and absolute. `motionfit.adapt.predict` takes a step. Where the
+    skin's active points change much the derivative holds for a per cent or two.
     """
     if of_reference and reference is None:
         raise InputError("of_reference= asks how the reference grows; give reference=")
@@ -222,16 +223,16 @@ def _followed_field(field: DepthField, part: str, old: Character, new: Character
     """The same grid, on which each depth goes with the distance to the skin; what is inside stays inside."""
     import igl
 
-    triangles, coefficients = part_surface(old, part), np.asarray(field.coefficients)
+    surface, coefficients = part_surface(old, part), np.asarray(field.coefficients)
     axes = [np.asarray(field.origin)[a] + np.asarray(field.spacing)[a] * np.arange(coefficients.shape[a])
             for a in range(3)]  # fmt: skip
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     before, after = (
-        np.sqrt(igl.point_mesh_squared_distance(nodes, standing_vertices(b)[triangles.used], triangles.triangles)[0])
+        np.sqrt(igl.point_mesh_squared_distance(nodes, standing_vertices(b)[surface.used], surface.triangles)[0])
         for b in (old, new)
     )
     depths = coefficients
-    for axis in range(3):
+    for axis in range(3):  # the splines' values at the nodes
         depths = correlate1d(depths, (0.125, 0.75, 0.125), axis, mode="mirror")
     depths = depths * (after / np.maximum(before, 1e-12)).reshape(depths.shape)
     positions, rotations = (x[0, np.asarray(field.joints)] for x in host_kinematics(standing(new.skeleton)))
@@ -254,7 +255,8 @@ def _owners(term: Term, whole: Clearance) -> list[Int[np.ndarray, " columns"]]:
     if isinstance(term, CapsuleClearance):
         return [owner]
     sets = [[i for i, field in enumerate(whole.term.field_of) if field == k] for k in range(len(term.fields))]
-    return [np.repeat(owner[some], [SOLVE_PROBES[whole.part_of_set[i].split("_", 1)[1]] for i in some]) for some in sets]
+    count = [SOLVE_PROBES[part.partition("_")[2]] for part in whole.part_of_set]
+    return [np.repeat(owner[some], [count[i] for i in some]) for some in sets]
 
 
 def _allowed(term: Term) -> Float[np.ndarray, "frames columns"]:
