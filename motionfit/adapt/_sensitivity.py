@@ -70,6 +70,7 @@ def girth_derivative(
     `grow(fit.problem.character, {"trunk": scale})` takes, at scale 1. With `of_reference` it is the reference that
     grows, and with it the overlap that does not count. Blocks after the limbs are not looked through.
 
+    Turn on double precision (`jax_enable_x64`): in single precision it comes out rough, soft directions above all.
     The fit is first solved on to `tolerance`, relative and absolute. `motionfit.adapt.predict` takes a step. Where the
     skin's active points change much the derivative holds for a per cent or two.
     """
