@@ -14,12 +14,14 @@ from motionfit.adapt._limits import reference_depths
 from motionfit.adapt._many import adapt_many
 from motionfit.adapt._per_frame import per_frame_ik, smoothed_corrections
 from motionfit.adapt._procedure import BLOCKS, DEFAULT, adapt, arms, legs
+from motionfit.adapt._sensitivity import girth_derivative, predict
 from motionfit.adapt._standing import measure_standing, source_stance
 
 __all__ = [
     "BLOCKS", "DEFAULT", "GROUPS", "Group", "OBJECTIVES", "Sphere", "Turn", "adapt", "adapt_many", "arms", "balance",
-    "build_clearance", "collisions", "footskate", "forearm", "legs", "limbs", "measure_standing", "multi_start",
-    "per_frame_ik", "reference_depths", "smoothed_corrections", "source_stance", "volume_depths",
+    "build_clearance", "collisions", "footskate", "forearm", "girth_derivative", "legs", "limbs", "measure_standing",
+    "multi_start", "per_frame_ik", "predict", "reference_depths", "smoothed_corrections", "source_stance",
+    "volume_depths",
 ]  # fmt: skip
 
 

@@ -124,18 +124,21 @@ class Volumes(eqx.Module):
         return origin + start, origin + rotation.rotate(turn, jnp.asarray(self.end)[None])
 
 
-def fit_volumes(character: Character, kind: str = "capsule") -> Volumes:
+def fit_volumes(
+    character: Character, kind: str = "capsule", owner: Int[np.ndarray, " vertices"] | None = None
+) -> Volumes:
     """Cylinders, capsules or ellipsoids of the segments that have a role and skin.
 
     The axis is the eigenvector of the area-weighted covariance that is nearest to the bone. Points on the side of
     a cylinder of radius r have variance r^2/2 in each direction across it, so r^2 = lambda_2 + lambda_3, and the
     two half widths of an elliptic one are sqrt(2 lambda). A surface sample of an ellipsoid has variance close to
-    a_i^2 / 3 per axis (exact for the sphere): thesis 5.6.
+    a_i^2 / 3 per axis (exact for the sphere): thesis 5.6. `owner` says whose bone each vertex counts for (None:
+    `allocate_vertices`).
     """
     if kind not in ("cylinder", "capsule", "ellipsoid"):
         raise InputError(f"unknown volume {kind!r}; there are cylinder, capsule, ellipsoid")
     skeleton = character.skeleton
-    owner, areas = allocate_vertices(character), vertex_areas(character)
+    owner, areas = allocate_vertices(character) if owner is None else owner, vertex_areas(character)
     vertices = np.asarray(character.skin.vertices_bind, float)
     positions, rotations = bind_pose(skeleton)
     tips = bone_tips(skeleton)
