@@ -20,6 +20,7 @@ from motionfit.shape.bodies import builtin_skeleton
 # Perry & Burnfield, Gait Analysis (2010): stance takes 60 to 62 % of the cycle.
 STRIKE, LIFT = 0.045, 0.655
 FLAT = (0.115, 0.38)  # foot flat to heel rise
+MOST_BEND = 1.1  # [rad] of the toes; Perry & Burnfield: about 55 degrees before the foot leaves the ground
 DENSE = 480  # samples of one cycle on which the leg paths are laid out
 
 
@@ -79,6 +80,7 @@ class _Gait:
         ball = self.bind[joint["left_toe"]] - ankle
         self.ball = np.array([0.0, -ankle[1], ball[2] + 0.006 * self._height()])
         dense = np.arange(DENSE) / DENSE
+        self.toes = 0.052 * self._height()  # from the joint to the tip of the skin
         self.pitch = self._pitch_curve(dense)
         self.height_offset = 0.0
         self.ankle_path = {}
@@ -244,10 +246,15 @@ class _Gait:
             )
         turn = self._foot_turn(side, phase)
         world[joint[f"{side}_foot"]] = turn
-        # toes stay on the ground while the heel rises
+        # toes stay on the ground while the heel rises, and come up again no faster than the ball leaves it
         own = np.mod(phase - (0.5 if side == "right" else 0.0), 1.0)
         pitch = self.pitch(own)
-        bend = np.clip(pitch, 0.0, 0.6) * _ease((LIFT + 0.06 - own) / 0.08)
+        bend = np.clip(pitch, 0.0, MOST_BEND) * _ease((LIFT + 0.06 - own) / 0.08)
+        toe = self.bind[joint[f"{side}_toe"]] - self.bind[joint[f"{side}_foot"]]
+        height = ankle[:, 1] + turn.apply(toe)[:, 1] - self.bind[joint[f"{side}_toe"]][1]
+        least = pitch - np.arcsin(np.clip((height - 0.004) / self.toes, 0.0, 1.0))
+        bend = 0.5 * (bend + least + np.sqrt((bend - least) ** 2 + 0.03**2))
+        bend = np.clip(bend, 0.0, MOST_BEND) * _ease(pitch / 0.1)
         world[joint[f"{side}_toe"]] = turn * Rotation.from_rotvec(-bend[:, None] * np.array([1.0, 0, 0]))
 
 

@@ -43,6 +43,7 @@ JERK_SHARE = 4.0  # of the hands' own jerk, what the correction may add at the c
 LEVER = 0.5  # [m] shoulder to hand
 LEAST_JERK = 30.0  # [m/s^3] for clips that stand still
 MOST_JERK = 1.04  # ratio to the source's
+CALM = 2.0  # knots over which a correction that is too jerky is smoothed before it is solved again
 ROUNDS, PATIENCE = 9, 2  # rounds at most, and rounds without a better result
 CLOSER = (0, 1)  # rounds after which more frames are looked at
 
@@ -59,7 +60,8 @@ class Stage(NamedTuple):
 
 
 class Iterate(NamedTuple):
-    """A round's result; `faults` (jerk over the limit, violations left, violations foreseen) say how good it is."""
+    """A round's result; `faults` say how good it is: what is left and jerk over the limit, a tenth of which counts as
+    much as a tolerance in the mean; then the violations foreseen."""
 
     faults: tuple[float, ...]
     correction: Correction
@@ -169,7 +171,7 @@ def limbs(
             over = looks.joined(after - own, on_skin - looks.basis, quiet)
             beyond = np.where(quiet, 0.0, looks.beyond(on_skin, after - own, ALLOWED_EXCESS, beyond))
         jerk = derivative_ratio(_final(controls, whole, correction).apply(base), base, 3) or 1.0
-        faults = (max(jerk - MOST_JERK, 0.0), *(_amount(x) for x in (left, over)))
+        faults = (max(jerk - MOST_JERK, 0.0) / 0.1 + _amount(left) / TOLERANCE, _amount(over))
         # one that was looked at in fewer frames cannot be compared
         if faults < best.faults or round_ in CLOSER:
             best, since = Iterate(faults, correction, result.problem, after, allowed - used, left.max(initial=0.0)), 0
@@ -178,6 +180,7 @@ def limbs(
             break
         if jerk > MOST_JERK:
             smooth *= 0.5
+            correction = _calmed(correction)
         if over.max() > ENOUGH * TOLERANCE:
             # the solver sees some probes only, and its corrections are smooth: what they left is taken off
             more = np.where(over > ENOUGH * TOLERANCE, after - used, 0.0)
@@ -187,6 +190,13 @@ def limbs(
     details = {"pairs": [p.name for p in pairs], "frames": seen.frames, "excess_before_m": excess,
                "excess_after_m": best.depths - own, "held_back_m": best.held_back}  # fmt: skip
     return Fit(final, final.apply(base), base, status, tuple(history), best.problem, details)  # pyright: ignore[reportArgumentType]
+
+
+def _calmed(correction: Correction) -> Correction:
+    """Control points smoothed in time, to go on from: where an arm is in deep, neighbouring frames may have found
+    opposite ways out, and no smoothness term brings them back over what lies between."""
+    points = tuple(gaussian_filter1d(np.asarray(p, float), CALM, mode="nearest") for p in correction.points)
+    return dataclasses.replace(correction, points=points)
 
 
 def _check_start(start: Fit, seen: Seen, pairs: tuple[Pair, ...]) -> None:
