@@ -160,7 +160,18 @@ class Problem(eqx.Module):
         return {k: float(v) for k, v in zip(self.terms, costs, strict=True)}
 
     def _points(self, correction: Correction | None) -> tuple[Array, ...]:
-        return tuple(jnp.asarray(p) for p in (correction or Correction.zero(self.controls)).points)
+        """A correction's control points, by name; those of a whole clip, on the same knots as its padded length that a
+        solver sees, are filled up with zeros."""
+        if correction is None:
+            return tuple(jnp.zeros(c.basis.count) for c in self.controls)
+        had = {c.name: p for c, p in zip(correction.controls, correction.points, strict=True)}
+        missing = [c.name for c in self.controls if c.name not in had or len(had[c.name]) > c.basis.count]
+        if missing:
+            raise InputError(f"the correction does not fit the problem's control {', '.join(missing)}; it has "
+                             f"{', '.join(had) or 'none'}")  # fmt: skip
+        return tuple(
+            jnp.pad(jnp.asarray(had[c.name]), (0, c.basis.count - len(had[c.name]))) for c in self.controls
+        )
 
     def report(self, correction: Correction | None = None) -> str:
         """A table of the terms: weight, cost and the frame where it is worst."""

@@ -96,3 +96,14 @@ def test_real_walk_on_a_real_heavy_body(shared_data):
     assert ((before.depth - own.depth) > 0.01).any(1).mean() > 0.9
     assert ((after.depth - own.depth) > 0.01).any(1).mean() <= 0.02
     assert after.inside_ratio <= own.inside_ratio + 0.002
+
+
+def test_hands_deep_in_a_belly_find_one_way_out(shared_data):
+    """An idling recording at 24 frames per second on a child: where the arms are in deep, neighbouring frames found
+    opposite ways out, and the correction shook."""
+    clip = mf.load_motion(shared_data / "bvh_other" / "reactidle_002_acted.bvh")[:100]
+    child = mf.load_character("builtin:child")
+    fit = mf.adapt(clip, child, blocks=("arms", "legs"))
+    assert fit.details["excess_before_m"].max() > 0.05
+    assert fit.details["excess_after_m"].max() < 0.01
+    assert mf.metrics.derivative_ratio(fit.motion, fit.base, 3) <= 1.05

@@ -171,3 +171,20 @@ def test_blocks_side_by_side_are_those_one_after_the_other(still):
     assert done == [("left_upper_arm", 1, 2), ("right_upper_arm", 2, 2)]
     with pytest.raises(mf.InputError, match="side by side"):
         mf.fit(problem, ((left, mf.Block("again", ("left_upper_arm",))),))
+
+
+def test_a_problem_takes_a_correction_by_name(still):
+    """Of the whole clip, which has the first of the control points that the padded one has, too."""
+    character, motion = still
+    controls = tuple(_control(character, motion, r) for r in ("left_upper_arm", "left_forearm"))
+    problem = mf.Problem(character, motion, {"effort": mf.terms.Effort(1.0)}, controls)
+    points = tuple(jnp.asarray(np.random.default_rng(k).normal(size=c.basis.count)) for k, c in enumerate(controls))
+    whole = mf.Correction(controls, points)
+    turned_round = mf.Correction(controls[::-1], points[::-1])
+    assert problem.costs(turned_round) == problem.costs(whole)
+    short = mf.Correction(controls, tuple(p[:-2] for p in points))
+    filled = mf.Correction(controls, tuple(p.at[-2:].set(0.0) for p in points))
+    assert problem.costs(short) == problem.costs(filled)
+    assert problem.report(short) == problem.report(filled)
+    with pytest.raises(mf.InputError, match="left_forearm; it has left_upper_arm"):
+        problem.costs(mf.Correction(controls[:1], points[:1]))

@@ -15,6 +15,7 @@ from motionfit.io.npz import read_npz, write_npz
 
 CLIPS = (".bvh", ".glb", ".gltf", ".npz")
 CHARACTERS = (".glb", ".gltf")
+CLIP = "a motion clip"
 LATER = (".dae", ".amc", ".asf", ".c3d", ".fbx")
 
 Roles = Mapping[str, str] | str | os.PathLike | None
@@ -38,7 +39,7 @@ def load_motion(
     file with one. `start`, `end` [s] cut the clip and `fps` [1/s] resamples it.
     """
     names = load_role_mapping(roles) if isinstance(roles, str | os.PathLike) else roles
-    ending = _ending(path, CLIPS, "a motion clip")
+    ending = _ending(path, CLIPS, CLIP)
     if ending == ".bvh":
         motion = read_bvh(path, unit=unit, up=up, rest_frame=rest_frame, roles=names)
     elif ending == ".npz":
@@ -106,6 +107,8 @@ def _ending(path: str | os.PathLike, allowed: tuple[str, ...], what: str) -> str
     ending = pathlib.Path(path).suffix.lower()
     if ending in allowed:
         return ending
+    if what == CLIP and str(path).startswith("builtin:"):
+        raise InputError(f"{path}: built-in clips are made by functions; call motionfit.samples.walk()")
     hint = "is not read yet; convert it to .glb or .bvh" if ending in LATER else f"is not {what}"
     raise InputError(f"{path}: {ending or 'no ending'} {hint}; endings: {', '.join(allowed)}")
 
