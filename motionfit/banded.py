@@ -24,6 +24,8 @@ from jaxtyping import Float, Int, PyTree
 from motionfit._types import AnyArray
 from motionfit.splines import Basis
 
+FRAMES_AT_ONCE = 24_000  # of all products that are formed together: some 10 kB each
+
 
 class Banded(lx.AbstractLinearSolver):
     """Solves `min |A x - b|` where x is a tuple of control points, one array per control, all on one basis.
@@ -106,8 +108,14 @@ class Banded(lx.AbstractLinearSolver):
         """Rows fn(x) of the control points x, (frames, n) each, and all of their Jacobian that is not zero, by control
         and colour: (controls * width, frames, n)."""
         seeds = _seeds(len(x), len(x[0]), self.width, x[0].dtype)
+        # as many products at once as memory bears: for a long clip one or a few
+        parts = [p for p in range(1, len(seeds) + 1) if len(seeds) % p == 0]
+        part = max((p for p in parts if p * len(self.first) <= FRAMES_AT_ONCE), default=1)
         product = jax.vmap(lambda seed: jax.jvp(fn, (x,), ((*seed,),)), out_axes=(None, 0))
-        return product(seeds)
+        if part == len(seeds):
+            return product(seeds)
+        value, columns = jax.lax.map(product, seeds.reshape(-1, part, *seeds.shape[1:]))
+        return jax.tree.map(lambda v: v[0], value), jax.tree.map(lambda c: c.reshape(-1, *c.shape[2:]), columns)
 
     def times(self, columns: tuple[Array, ...], x: tuple[Array, ...]) -> tuple[Array, ...]:
         """The product of such a Jacobian with control points."""

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import motionfit as mf
+import motionfit.banded
 from motionfit._fit import banded_solver, block_adjoint, block_work, levenberg_marquardt, solve_block
 from motionfit._motion import rest_motion
 from motionfit.banded import Banded
@@ -188,3 +189,21 @@ def test_a_wrong_reach_is_found_out(average):
             assert mf.fit(right, block).history[-1].cost_after < 1e-3
     with pytest.raises(mf.InputError, match="cannot be -1"):
         mf.Custom(_wide, 0.2, reach=-1)
+
+
+@pytest.mark.parametrize("at_once", [10**6, 100, 1])
+def test_columns_times_points_are_the_jacobian(at_once, monkeypatch):
+    """However many of the products are formed together."""
+    monkeypatch.setattr(motionfit.banded, "FRAMES_AT_ONCE", at_once)
+    basis = bspline_basis(30, 1 / 60, 0.1)
+    solver = Banded.of(basis, 1)
+    x, way = (tuple(jnp.asarray(np.random.default_rng(k).normal(size=(2, basis.count)))) for k in (0, 1))
+
+    def rows(x):
+        signals = jnp.stack([basis(p) for p in x], axis=1)
+        return (jnp.sin(signals), jnp.pad(signals[1:] * signals[:-1], ((0, 1), (0, 0))))
+
+    value, columns = solver.columns_of(x, rows)
+    exact, along = jax.jvp(rows, (x,), (way,))
+    for told, expected in zip((*value, *solver.times(columns, way)), (*exact, *along), strict=True):
+        np.testing.assert_allclose(told, expected, atol=1e-12)
