@@ -129,7 +129,7 @@ class Problem(eqx.Module):
         motion: Motion,
         terms: Mapping[str, Term | Energy],
         controls: tuple[Control, ...] = (),
-        weights: Mapping[str, float | Array] | None = None,
+        weights: Mapping[str, float | AnyArray] | None = None,
     ):
         unknown = set(weights or {}) - set(terms)
         if unknown:
@@ -169,9 +169,7 @@ class Problem(eqx.Module):
         if missing:
             raise InputError(f"the correction does not fit the problem's control {', '.join(missing)}; it has "
                              f"{', '.join(had) or 'none'}")  # fmt: skip
-        return tuple(
-            jnp.pad(jnp.asarray(had[c.name]), (0, c.basis.count - len(had[c.name]))) for c in self.controls
-        )
+        return tuple(jnp.pad(jnp.asarray(had[c.name]), (0, c.basis.count - len(had[c.name]))) for c in self.controls)
 
     def report(self, correction: Correction | None = None) -> str:
         """A table of the terms: weight, cost and the frame where it is worst."""

@@ -39,11 +39,12 @@ def _solved(held: Held, problem: mf.Problem) -> dict[str, np.ndarray]:
     """The optimum of a problem, block after block: by the cost to the root of its rounding, then to a level slope."""
     blocks = [dataclasses.replace(s.block, max_steps=200, tolerance=1e-10) for s in held.stages]
     correction = mf.fit(problem, blocks, correction=mf.Correction(problem.controls, held.points)).correction
-    points = list(correction.points)
+    points = [jnp.asarray(p) for p in correction.points]
     for block in blocks:
-        work = block_work(problem, block, tuple(points))
+        work, solver = block_work(problem, block, tuple(points)), banded_solver(problem, block)
+        assert solver is not None
         for _ in range(6):
-            newton = _answer(work, _slope(work, work.start), banded_solver(problem, block))
+            newton = _answer(work, _slope(work, work.start), solver)
             work = work._replace(start=jax.tree.map(jnp.add, work.start, newton))
         assert max(float(jnp.abs(s).max()) for s in _slope(work, work.start)) < 1e-9
         for k, new in zip(work.free.tolist(), work.start, strict=True):

@@ -32,10 +32,10 @@ from motionfit._fit import Fit, Work, banded_solver, block_work
 from motionfit._fit import fit as refit
 from motionfit._motion import Motion, host_kinematics, rest_motion
 from motionfit._onto import onto
-from motionfit._problem import Problem
+from motionfit._problem import Energy, Problem
 from motionfit._skeleton import SIDES
 from motionfit._types import InputError
-from motionfit.adapt._clearance import Clearance, Term, build_clearance, volume_depths
+from motionfit.adapt._clearance import Clearance, build_clearance, volume_depths
 from motionfit.adapt._limbs import ALLOWED_EXCESS, LIMBS, SOLVE_PROBES, Stage
 from motionfit.adapt._limbs import _stages as limb_stages
 from motionfit.adapt._limits import ENOUGH
@@ -52,6 +52,7 @@ WAYS = (1.0, -1.0)
 NAMES = {"arms": tuple(f"{side}_arm" for side in SIDES), "legs": ("legs",)}
 
 Change = dict[str, dict[str, np.ndarray]]
+Seen = SkinClearance | CapsuleClearance  # the objectives that see shapes
 
 
 def girth_derivative(
@@ -86,9 +87,11 @@ def girth_derivative(
         there.append([held.problem_on(reference=g) if of_reference else held.problem_on(g) for g in grown])
     blocks = [dataclasses.replace(s.block, max_steps=MAX_STEPS, tolerance=tolerance) for s in held.stages]
     points = refit(problem, blocks, correction=Correction(problem.controls, held.points)).correction.points
+    points = tuple(jnp.asarray(p) for p in points)
     moves = [[np.zeros(p.shape) for p in points] for _ in parts]
     for block in blocks:
         solver = banded_solver(problem, block)
+        assert solver is not None  # every term of limbs says its reach
         work = block_work(problem, block, points)
         for problems, move in zip(there, moves, strict=True):
             # what the blocks before it do counts too
@@ -158,18 +161,23 @@ class Held(NamedTuple):
         filling = ((0, problem.motion.frame_count - self.frames), (0, 0))
         for stage, alone, kept in zip(self.stages, self.alone, self.kept, strict=True):
             name = f"{stage.block.name}_clearance"
-            term = followed(terms[name], stage.clearance, problem.character, body)
+            term = followed(self._term(stage), stage.clearance, problem.character, body)
             more = self._kept(stage, alone, body, reference or self.reference) - kept
             terms[name] = _allowing_more(term, np.pad(more, filling), stage.clearance)
         return Problem(body, onto(problem.motion, body.skeleton), terms, problem.controls, problem.weights)
 
+    def _term(self, stage: Stage) -> Seen:
+        term = self.problem.terms[f"{stage.block.name}_clearance"]
+        assert isinstance(term, SkinClearance | CapsuleClearance)
+        return term
+
     def _alone(self, stage: Stage) -> Bool[np.ndarray, " pairs"]:
         """The pairs of a stage that may keep what they show: the fit had nothing to take out there."""
-        term = self.problem.terms[f"{stage.block.name}_clearance"]
+        term = self._term(stage)
         allowed, owner = _allowed(term), np.concatenate(_owners(term, stage.clearance))
         before = volume_depths(stage.clearance, self.problem.motion[np.arange(self.frames)])
         first = [int(np.argmax(owner == k)) for k in range(len(stage.clearance.pairs))]
-        return (allowed[: self.frames, first] >= before - 1e-5).all(axis=0)
+        return np.all(allowed[: self.frames, first] >= before - 1e-5, axis=0)
 
     def _kept(
         self, stage: Stage, alone: Bool[np.ndarray, " pairs"], character: Character, reference: Character | None
@@ -190,6 +198,7 @@ class Held(NamedTuple):
 
 def _depths(clearance: Clearance, old: Character, new: Character, motion: Motion):
     """Depth [m] of every pair on a body that a clearance follows to."""
+    assert isinstance(clearance.term, SkinClearance | CapsuleClearance)
     term = followed(clearance.term, clearance, old, new)
     return volume_depths(clearance._replace(term=term), motion)
 
@@ -197,7 +206,7 @@ def _depths(clearance: Clearance, old: Character, new: Character, motion: Motion
 # --- a clearance on another body of the same topology -----------------------------------------------------------
 
 
-def followed(term: Term, whole: Clearance, old: Character, new: Character) -> Term:
+def followed(term: Seen, whole: Clearance, old: Character, new: Character) -> Seen:
     """A clearance term with its volumes, or its probes and fields, as they are on a body of the same topology.
 
     `whole` is the clearance that the term was made of. The same vertices are probes and belong to the same segments.
@@ -242,30 +251,35 @@ def _followed_field(field: DepthField, part: str, old: Character, new: Character
                        (spline_filter(depths, order=2), positions, turns))  # fmt: skip
 
 
+def _field_of(whole: Clearance) -> tuple[int, ...]:
+    assert isinstance(whole.term, SkinClearance)
+    return whole.term.field_of
+
+
 def _parts_hit(whole: Clearance) -> list[str]:
     """The part that each field of a clearance is of."""
-    other = {}
-    for part, pair, field in zip(whole.part_of_set, whole.pair_of_row, whole.term.field_of, strict=True):
+    other, fields = {}, _field_of(whole)
+    for part, pair, field in zip(whole.part_of_set, whole.pair_of_row, fields, strict=True):
         other[field] = next(p for p in whole.pairs[pair][:2] if p != part)
     return [other[k] for k in range(len(other))]
 
 
-def _owners(term: Term, whole: Clearance) -> list[Int[np.ndarray, " columns"]]:
+def _owners(term: Seen, whole: Clearance) -> list[Int[np.ndarray, " columns"]]:
     """Of which pair each column of a solver's term is, array by array of its `allowed`."""
     owner = np.array(whole.pair_of_row)
     if isinstance(term, CapsuleClearance):
         return [owner]
-    sets = [[i for i, field in enumerate(whole.term.field_of) if field == k] for k in range(len(term.fields))]
+    sets = [[i for i, field in enumerate(_field_of(whole)) if field == k] for k in range(len(term.fields))]
     count = [SOLVE_PROBES[part.partition("_")[2]] for part in whole.part_of_set]
     return [np.repeat(owner[some], [count[i] for i in some]) for some in sets]
 
 
-def _allowed(term: Term) -> Float[np.ndarray, "frames columns"]:
+def _allowed(term: Seen) -> Float[np.ndarray, "frames columns"]:
     rows = (term.allowed,) if isinstance(term, CapsuleClearance) else term.allowed
     return np.concatenate([np.asarray(x, float) for x in rows], axis=1)
 
 
-def _allowing_more(term: Term, more: Float[np.ndarray, "frames pairs"], whole: Clearance) -> Term:
+def _allowing_more(term: Seen, more: Float[np.ndarray, "frames pairs"], whole: Clearance) -> Seen:
     """The term with more depth [m] allowed."""
     owners = _owners(term, whole)
     rows = np.split(_allowed(term), np.cumsum([len(o) for o in owners])[:-1], axis=1)
@@ -290,7 +304,7 @@ def _slope_in_signals(work: Work, signals: Float[Array, "frames free"]) -> Float
         kin = objective.kinematics(fixed.at[:, jnp.asarray(work.free)].set(signals))
         total = jnp.zeros_like(signals[:, 0])
         for term, weight in zip(objective.terms, objective.weights, strict=True):
-            if (term.reach == 0) == local:
+            if not isinstance(term, Energy) and (term.reach == 0) == local:
                 total = total + 0.5 * weight * jnp.sum(jnp.square(term.residual(kin).reshape(len(total), -1)), axis=1)
         return total
 
