@@ -363,7 +363,7 @@ def shapes(count: int, frame_count: int = FRAMES) -> Iterator[Metric]:
         yield seconds(f"{key}.run", first_s / count, "s/shape")
         yield time_ratio(f"{key}.per_shape_over_alone", first_s / count / alone_s)
         return
-    pace = interleaved(many, alone, rounds=5)
+    pace = interleaved(many, alone, rounds=2)  # minutes each
     yield seconds(f"{key}.run", pace.run_s / count, "s/shape")
     yield time_ratio(f"{key}.per_shape_over_alone", pace.ratio / count)
 

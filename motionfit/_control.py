@@ -5,11 +5,11 @@ import pathlib
 import zipfile
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
 from motionfit import rotation
 from motionfit._motion import Motion
@@ -106,11 +106,7 @@ class Correction(eqx.Module):
         if frames != motion.frame_count:
             raise InputError(f"the correction was made for {frames} frames, the motion has {motion.frame_count}")
         if isinstance(motion.rotations, np.ndarray):
-            corrected = np.asarray(_turned_jit(motion, self))
-            base = motion.rotations
-            # files are float64: what did not move must not be rounded to JAX's float32 on the way
-            moved = (corrected != np.asarray(jnp.asarray(base))).any(-1, keepdims=True)
-            rotations = np.where(moved, corrected.astype(base.dtype), base)
+            rotations = _turned_on_host(motion, self)
         else:
             rotations = turned(motion, self.controls, self.signals())
         return Motion(motion.skeleton, motion.root, rotations, motion.dt, motion.translations)
@@ -155,6 +151,22 @@ def load_correction(path: str | pathlib.Path) -> Correction:
     return Correction(tuple(controls), tuple(points))
 
 
-@jax.jit
-def _turned_jit(motion: Motion, correction: Correction) -> Float[Array, "frames joints 4"]:
-    return turned(motion, correction.controls, correction.signals())
+def _turned_on_host(motion: Motion, correction: Correction) -> Float[np.ndarray, "frames joints 4"]:
+    """`turned` in double precision whatever JAX's mode is, without compiling anything for each length of clip."""
+    vectors: dict[int, np.ndarray] = {}
+    for control, points in zip(correction.controls, correction.points, strict=True):
+        basis = control.basis
+        clamped = np.clip(np.asarray(points, float), np.asarray(control.lower), np.asarray(control.upper))
+        own = np.asarray(basis.first)[:, None] + np.arange(np.shape(basis.values)[1])
+        signal = (clamped[own] * np.asarray(basis.values, float)).sum(axis=1, keepdims=True)
+        for drive in control.drives:
+            push = signal * float(drive.gain) * np.asarray(drive.axis_parent, float).reshape(-1, 3)
+            vectors[int(drive.joint)] = vectors.get(int(drive.joint), 0.0) + push
+    rotations = np.array(motion.rotations)
+    for joint, vector in vectors.items():
+        moved = vector.any(axis=1)
+        if not moved.any():
+            continue
+        own = Rotation.from_quat(np.asarray(rotations[moved, joint], float), scalar_first=True)
+        rotations[moved, joint] = (Rotation.from_rotvec(vector[moved]) * own).as_quat(scalar_first=True)
+    return rotations
