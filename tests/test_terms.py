@@ -30,7 +30,7 @@ def _problem(term, character, motion, joints=("left_upper_arm", "right_thigh", "
 
 def signed_depths(clearance, kin):
     """Depth [m] per frame and pair, negative for a gap."""
-    rows = np.asarray(row_depths(clearance.term, kin, None))
+    rows = np.asarray(row_depths(clearance.term, kin))
     owner = np.array(clearance.pair_of_row)
     return np.stack([rows[:, owner == k].max(axis=1) for k in range(len(clearance.pairs))], axis=1)
 

@@ -4,16 +4,16 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
+from scipy.special import expit
 
 from motionfit._character import PARTS, Character
 from motionfit._motion import Kinematics, Motion, forward_kinematics
 from motionfit._skeleton import SIDES
-from motionfit._types import AnyArray, InputError
+from motionfit._types import InputError
 from motionfit.shape.field import (
     Probes,
     fit_field,
@@ -160,40 +160,36 @@ def _joint(character: Character, pairs: tuple[Pair, ...]) -> Clearance:
 CHUNK = 64  # frames looked at at once: one program whatever the clip's length, and bounded memory
 
 
-def over_time(look, term: Term, motion: Motion, allowed: Float[np.ndarray, "frames rows"] | None = None) -> list:
-    """`look(term, kinematics, allowed)` of chunk after chunk; the last frame is repeated to fill the last chunk."""
+def over_time(look, term: Term, motion: Motion) -> Float[np.ndarray, "frames ..."]:
+    """`look(term, kinematics)` of chunk after chunk; the last frame is repeated to fill the last chunk."""
     frames = motion.frame_count
     order = np.minimum(np.arange(-(-frames // CHUNK) * CHUNK), frames - 1).reshape(-1, CHUNK)
-    return [_look(look, term, motion[some], None if allowed is None else allowed[some]) for some in order]
+    return np.concatenate([np.asarray(_look(look, term, motion[some])) for some in order])[:frames]
 
 
 @eqx.filter_jit
-def _look(look, term: Term, motion: Motion, allowed: Float[AnyArray, "frames rows"] | None):
-    return look(term, forward_kinematics(motion.skeleton, motion), allowed)
+def _look(look, term: Term, motion: Motion):
+    return look(term, forward_kinematics(motion.skeleton, motion))
 
 
 def all_rows(term: Term, motion: Motion) -> Float[np.ndarray, "frames rows"]:
     """Depth [m] of every row of a term in every frame; negative where there is a gap."""
-    return np.concatenate([np.asarray(rows, float) for rows in over_time(row_depths, term, motion)])[
-        : motion.frame_count
-    ]
+    if isinstance(term, SkinClearance):
+        return over_time(_point_depths, term, motion).max(axis=2).astype(float)
+    return over_time(row_depths, term, motion).astype(float)
 
 
-def row_depths(term: Term, kin: Kinematics, allowed) -> Float[Array, "frames rows"]:
-    del allowed
+def row_depths(term: Term, kin: Kinematics) -> Float[Array, "frames rows"]:
     if isinstance(term, JointClearance):
         return jnp.asarray(term.min_distance) - term.distance(kin)
     return term.depth(kin)
 
 
-def _support(term: SkinClearance, kin: Kinematics, allowed) -> Float[Array, "sets points"]:
-    """How often a point is within 5 mm of its set's deepest, where the set is near to showing too much."""
-    counts = []
-    for k, depth in enumerate(term.point_depths(kin)):
-        deepest = jnp.max(depth, axis=1, keepdims=True)
-        matters = jax.nn.sigmoid((deepest - allowed[:, k, None]) / 0.01)
-        counts.append(jnp.sum(matters * jnp.clip(1.0 + (depth - deepest) / 0.005, 0.0, 1.0) + 1e-3 * depth, axis=0))
-    return jnp.stack(counts)
+def _point_depths(term: SkinClearance, kin: Kinematics) -> Float[Array, "frames sets points"]:
+    depths = term.point_depths(kin)
+    most = max(d.shape[1] for d in depths)
+    # a set of fewer points repeats its last one
+    return jnp.stack([jnp.pad(d, ((0, 0), (0, most - d.shape[1])), mode="edge") for d in depths], axis=1)
 
 
 def volume_depths(clearance: Clearance, motion: Motion) -> Float[np.ndarray, "frames pairs"]:
@@ -207,9 +203,14 @@ def volume_depths(clearance: Clearance, motion: Motion) -> Float[np.ndarray, "fr
 def support(
     clearance: Clearance, motion: Motion, allowed: Float[np.ndarray, "frames pairs"]
 ) -> Float[np.ndarray, "sets points"]:
-    """How much each probe has to do with the depth of its pair over the clip: what `reduced` goes by."""
-    rows = np.asarray(allowed[:, list(clearance.pair_of_row)], float)
-    return np.sum([np.asarray(x) for x in over_time(_support, clearance.term, motion, rows)], axis=0)
+    """How much each probe has to do with the depth of its pair over the clip: what `reduced` goes by.
+
+    It is how often a point is within 5 mm of its set's deepest, where the set is near to showing too much.
+    """
+    depth = over_time(_point_depths, clearance.term, motion)
+    deepest = depth.max(axis=2, keepdims=True)
+    matters = expit((deepest - allowed[:, list(clearance.pair_of_row), None]) / 0.01)
+    return (matters * np.clip(1.0 + (depth - deepest) / 0.005, 0.0, 1.0) + 1e-3 * depth).sum(axis=0)
 
 
 def reduced(

@@ -148,7 +148,7 @@ def limbs(
         return lambda name, done, _: progress(name, round_ * steps + done, ROUNDS * steps)  # pyright: ignore[reportOptionalCall]
 
     for round_ in range(ROUNDS):
-        problem = _problem(character, seen, stages, beyond, smooth, (small, moved))
+        problem = _problem(character, seen, stages, beyond, smooth, everything, (small, moved))
         result = fit(problem, _side_by_side(stages), sweeps, correction=correction, progress=told(round_))
         correction, history = result.correction, [*history, *result.history]
         moved = result.motion[np.arange(small.frame_count)]
@@ -271,11 +271,15 @@ def _stages(
 
 def _problem(
     character: Character, seen: Seen, stages: list[Stage], beyond: Float[np.ndarray, "frames pairs"], smooth: float,
-    motions: tuple[Motion, ...],
+    everything: Clearance, motions: tuple[Motion, ...],
 ) -> Problem:  # fmt: skip
     """The terms of all stages; probes are chosen by what they had to do with in `motions`."""
     real, length = seen.motion.frame_count, seen.padded.frame_count
     terms: dict[str, Term] = {}
+    scores = np.zeros((0, 0))
+    if everything.part_of_set:
+        allowed = np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
+        scores = np.sum([support(everything, motion, allowed) for motion in motions], axis=0)
     for stage in stages:
         # however much the skin shows: a part that is LEAST_GAP away from the other's field is pushed no further
         limit = np.maximum(stage.allowed - beyond[:, stage.columns], -LEAST_GAP)
@@ -284,8 +288,9 @@ def _problem(
         limit = np.concatenate([limit, np.full((length - real, limit.shape[1]), 1e3)])
         name = f"{stage.block.name}_clearance"
         if stage.clearance.part_of_set:
-            score = sum(support(stage.clearance, motion, stage.allowed) for motion in motions)
-            terms[name] = reduced(stage.clearance, score, limit, SOLVE_PROBES)  # pyright: ignore[reportArgumentType]
+            # the sets of all pairs come in the order of their pairs, as those of a stage do
+            mine = np.isin(everything.pair_of_row, stage.columns)
+            terms[name] = reduced(stage.clearance, scores[mine], limit, SOLVE_PROBES)  # pyright: ignore[reportArgumentType]
         else:
             terms[name] = stage.clearance.allowing(limit)
     frames = np.arange(length)
