@@ -155,6 +155,23 @@ def test_corrections_save_and_apply_to_the_same_bits(still, tmp_path):
         again.apply(motion[:5])
 
 
+def test_files_and_arrays_get_the_same_correction(still, rng):
+    """On the host and traced: bounds, gains, axes per frame, and two controls that turn one joint."""
+    character, motion = still
+    joints = [character.skeleton.joint(r) for r in ("left_upper_arm", "left_forearm")]
+    axes = rng.normal(size=(motion.frame_count, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    basis = bspline_basis(motion.frame_count, float(motion.dt), 0.1)
+    drives = (mf.Drive(joints[0], axes, -0.7), mf.Drive(joints[1], np.eye(3)[1], 1.3))
+    controls = (mf.Control("both", drives, basis, -0.2, 0.5),
+                mf.Control("one", (mf.Drive(joints[0], np.eye(3)[2], 0.5),), basis))  # fmt: skip
+    correction = mf.Correction(controls, tuple(rng.normal(size=basis.count) for _ in controls))
+    traced = mf.Motion(motion.skeleton, motion.root, jnp.asarray(motion.rotations), motion.dt)
+    host, device = (np.asarray(correction.apply(m).rotations) for m in (motion, traced))
+    np.testing.assert_allclose(host, device, atol=1e-14)
+    assert np.abs(host - np.asarray(motion.rotations)).max() > 0.1
+
+
 def test_blocks_side_by_side_are_those_one_after_the_other(still):
     character, motion = still
     roles = ("left_upper_arm", "right_upper_arm")

@@ -70,6 +70,15 @@ def test_girth_on_the_skin(part, skin_fit, heavy, average):
     _compare(change[part], *ways)
 
 
+def test_a_session_in_single_precision_gets_the_same(skin_fit, average):
+    """Of one fit: what a session's precision would be is of no account."""
+    double = mf.adapt.girth_derivative(skin_fit, ("arms",), reference=average)["arms"]
+    with jax.enable_x64(False):
+        single = mf.adapt.girth_derivative(skin_fit, ("arms",), reference=average)["arms"]
+    for name, values in double.items():
+        np.testing.assert_allclose(single[name], values, atol=AGREE * np.abs(values).max() + 1e-9)
+
+
 @pytest.mark.parametrize("part", ["arms", "trunk"])
 def test_girth_of_the_reference(part, skin_fit, average):
     """Through the overlap that does not count."""

@@ -16,7 +16,15 @@ from motionfit._character import PARTS
 from motionfit._motion import bind_pose
 from motionfit.shape import grow, parse_girth
 from motionfit.shape.distance import capsule_depth, closest_on_lines, cylinder_depth, segment_distance
-from motionfit.shape.field import fit_field, inside_depths, make_probes, part_surface, standing, standing_vertices
+from motionfit.shape.field import (
+    depths,
+    fit_field,
+    inside_depths,
+    make_probes,
+    part_surface,
+    standing,
+    standing_vertices,
+)
 from motionfit.shape.volumes import fit_volumes
 from tests.helpers import central_difference
 
@@ -110,6 +118,17 @@ def test_a_field_moves_with_its_part(heavy, rng):
         for m, p in ((still, points), (moved, turn.apply(points) + shift))
     )
     np.testing.assert_allclose(before, after, atol=1e-9)
+
+
+def test_fields_side_by_side_are_those_alone(heavy, rng):
+    """A trunk on several joints and limbs on one, on grids of two sizes, each with its own points."""
+    walk = mf.onto(samples.walk(cycles=1), heavy.skeleton)[::20]
+    kin = mf.forward_kinematics(heavy.skeleton, walk)
+    fields = [fit_field(heavy, part) for part in ("left_thigh", "torso", "right_calf")]
+    posed = mf.metrics.posed_vertices(heavy, walk)
+    points = [jnp.asarray(posed[:, rng.integers(0, posed.shape[1], n)].swapaxes(1, 2)) for n in (7, 5, 9)]
+    alone = jnp.concatenate([f.depth(kin, p) for f, p in zip(fields, points, strict=True)], axis=1)
+    np.testing.assert_allclose(depths(kin, fields, points), alone, atol=1e-12)
 
 
 def test_lookups_have_the_gradient_that_differences_show(heavy, rng):

@@ -71,12 +71,25 @@ def girth_derivative(
     `grow(fit.problem.character, {"trunk": scale})` takes, at scale 1. With `of_reference` it is the reference that
     grows, and with it the overlap that does not count. Blocks after the limbs are not looked through.
 
-    Turn on double precision (`jax_enable_x64`): in single precision it comes out rough, soft directions above all.
-    The fit is first solved on to `tolerance`, relative and absolute. `motionfit.adapt.predict` takes a step. Where the
+    It is computed in double precision whatever JAX's mode is: differences of single-precision slopes are noise. The
+    fit is first solved on to `tolerance`, relative and absolute. `motionfit.adapt.predict` takes a step. Where the
     skin's active points change much the derivative holds for a per cent or two.
     """
     if of_reference and reference is None:
         raise InputError("of_reference= asks how the reference grows; give reference=")
+    with jax.enable_x64(True):
+        double = jax.tree.map(_double, (fit.correction, fit.problem))
+        fit = dataclasses.replace(fit, correction=double[0], problem=double[1])
+        return _derivative(fit, parts, reference, of_reference, tolerance)
+
+
+def _double(x):
+    return np.asarray(x, float) if eqx.is_inexact_array_like(x) and not isinstance(x, float) else x
+
+
+def _derivative(
+    fit: Fit, parts: Sequence[str], reference: Character | None, of_reference: bool, tolerance: float
+) -> Change:
     held, problem = Held.of(fit, reference), fit.problem
     # central differences, at the step that balances their error with rounding
     step = float(jnp.finfo(float).eps) ** (1 / 3)
