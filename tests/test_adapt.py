@@ -10,7 +10,10 @@ import pytest
 import motionfit as mf
 from motionfit import samples
 from motionfit._motion import joint_angles
+from motionfit.adapt._clearance import build_clearance, support
+from motionfit.adapt._limbs import _own_sets, _stages
 from motionfit.metrics import derivative_ratio, skin_depths
+from motionfit.shape.pairs import pairs_of
 
 pytestmark = pytest.mark.slow
 
@@ -108,3 +111,26 @@ def test_hands_deep_in_a_belly_find_one_way_out(shared_data):
     assert fit.details["excess_after_m"].max() < 0.01
     jerk = mf.metrics.derivative_ratio(fit.motion, fit.base, 3)
     assert jerk is not None and jerk <= 1.05
+
+
+def test_a_block_chooses_its_probes_by_their_own_part_in_what_is_wrong(heavy):
+    """All pairs are looked at together; each block takes the rows that are its own sets'."""
+    walk, pairs = mf.onto(samples.walk(cycles=1), heavy.skeleton)[::4], pairs_of("arms", "legs")
+    everything = build_clearance(heavy, pairs)
+    allowed = np.random.default_rng(0).uniform(0.0, 0.03, (walk.frame_count, len(pairs)))
+    together = support(everything, walk, allowed)
+    for stage in _stages(heavy, ("arms", "legs"), pairs, "vertex", allowed, np.zeros(len(pairs), bool)):
+        mine = _own_sets(everything, stage)
+        np.testing.assert_allclose(together[mine], support(stage.clearance, walk, stage.allowed), rtol=1e-6)
+
+
+def test_what_the_skin_never_showed_is_not_made_worse(shared_data):
+    """A dance with folded arms that is clean on the skin; the fields see an arm in the trunk all the same."""
+    clip = mf.load_motion(shared_data / "bvh" / "05_03_dance_folding_arms.bvh")
+    dancer, reference = (mf.load_character(shared_data / "characters" / f"{n}.glb")
+                         for n in ("athletic_female", "avg_male"))  # fmt: skip
+    fit = mf.adapt(clip, dancer, reference=reference, blocks=("arms", "legs"))
+    own = skin_depths(reference, mf.onto(clip, reference.skeleton), step=20).depth
+    before, after = (skin_depths(dancer, m, step=20).depth - own for m in (fit.base, fit.motion))
+    assert before.max() < 0.01
+    assert after.max() < 0.01

@@ -161,10 +161,10 @@ def test_gradients_through_the_solve(reaching):
         return sum(jnp.sum(jnp.sin(p)) for p in solved.points)
 
     x = np.array([0.8, 0.01])
-    expected = central_difference(outcome, x, 1e-4)
+    # a step at which it matters little where the two solves of a difference stop
+    expected = central_difference(outcome, x, 1e-3)
     for gradient in (jax.grad(outcome)(x), jax.jacfwd(outcome)(x)):
-        # the two solves of a difference stop 1e-9 apart
-        np.testing.assert_allclose(gradient, expected, rtol=1e-3, atol=1e-5)
+        np.testing.assert_allclose(gradient, expected, rtol=1e-3)
 
 
 def _wide(kin, goal):

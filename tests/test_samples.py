@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import motionfit as mf
 from motionfit import samples
 from motionfit._motion import host_kinematics, joint_angles
+from motionfit.metrics import posed_vertices
 
 
 @pytest.fixture(scope="module")
@@ -79,3 +81,11 @@ def test_the_script_reproduces_the_figures(shared_data):
     assert set(fitted) == set(HARMONICS)
     for role, rows in HARMONICS.items():
         np.testing.assert_allclose(fitted[role], rows, atol=1e-4, err_msg=role)
+
+
+@pytest.mark.parametrize("name", ["average", "child"])
+def test_no_toe_dips_under_the_floor(name):
+    """Of the skin: the toes reach further than any joint."""
+    body = mf.load_character(f"builtin:{name}")
+    walk = mf.onto(samples.walk(cycles=1, body=name), body.skeleton)
+    assert posed_vertices(body, walk)[..., 1].min() > -0.006

@@ -185,11 +185,35 @@ def limbs(
             # the solver sees some probes only, and its corrections are smooth: what they left is taken off
             more = np.where(over > ENOUGH * TOLERANCE, after - used, 0.0)
             stages = [_tighten(s, more[:, s.columns], float(small.dt)) for s in stages]
+    if looks is not None and best.left > TOLERANCE:
+        best = best._replace(correction=_unless_worse(best.correction, looks, stages, base, seen, controls, whole))
+        moved = _final(controls, whole, best.correction).apply(base)[seen.frames]
+        after = volume_depths(everything, moved)
+        best = best._replace(
+            depths=after, left=looks.joined(after - own, looks.depths(moved) - looks.own, quiet).max(initial=0.0)
+        )
     final = _final(controls, whole, best.correction)
     status = "violations_left" if best.left > TOLERANCE else "converged"
     details = {"pairs": [p.name for p in pairs], "frames": seen.frames, "excess_before_m": excess,
                "excess_after_m": best.depths - own, "held_back_m": best.held_back}  # fmt: skip
     return Fit(final, final.apply(base), base, status, tuple(history), best.problem, details)  # pyright: ignore[reportArgumentType]
+
+
+def _unless_worse(
+    correction: Correction, looks: SkinLooks, stages: list[Stage], base: Motion, seen: Seen,
+    controls: tuple[Control, ...], whole: Basis,
+) -> Correction:  # fmt: skip
+    """A correction without the blocks that leave their pairs deeper in each other, on the skin, than they were: where
+    the fields see what is not there, the clip is better left alone."""
+    moved = _final(controls, whole, correction).apply(base)
+    shown, before = (looks.depths(m[seen.frames]) - looks.own for m in (moved, base))
+    worse = [s.block.controls for s in stages if 0.0 < _amount(shown[:, s.columns]) >= _amount(before[:, s.columns])]
+    names = {name for block in worse for name in block}
+    points = tuple(
+        np.zeros(np.shape(p)) if c.name in names else p
+        for c, p in zip(correction.controls, correction.points, strict=True)
+    )
+    return dataclasses.replace(correction, points=points)
 
 
 def _calmed(correction: Correction) -> Correction:
@@ -269,6 +293,11 @@ def _stages(
     return made
 
 
+def _own_sets(everything: Clearance, stage: Stage) -> Bool[np.ndarray, " sets"]:
+    """Which sets of probes of all pairs are a stage's: both come in the order of their pairs."""
+    return np.isin(everything.pair_of_row, stage.columns)
+
+
 def _problem(
     character: Character, seen: Seen, stages: list[Stage], beyond: Float[np.ndarray, "frames pairs"], smooth: float,
     everything: Clearance, motions: tuple[Motion, ...],
@@ -288,9 +317,7 @@ def _problem(
         limit = np.concatenate([limit, np.full((length - real, limit.shape[1]), 1e3)])
         name = f"{stage.block.name}_clearance"
         if stage.clearance.part_of_set:
-            # the sets of all pairs come in the order of their pairs, as those of a stage do
-            mine = np.isin(everything.pair_of_row, stage.columns)
-            terms[name] = reduced(stage.clearance, scores[mine], limit, SOLVE_PROBES)  # pyright: ignore[reportArgumentType]
+            terms[name] = reduced(stage.clearance, scores[_own_sets(everything, stage)], limit, SOLVE_PROBES)  # pyright: ignore[reportArgumentType]
         else:
             terms[name] = stage.clearance.allowing(limit)
     frames = np.arange(length)
