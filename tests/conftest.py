@@ -24,6 +24,17 @@ settings.load_profile("motionfit")
 DATA = pathlib.Path(__file__).parents[2] / "shared" / "data"
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _programs_go_with_their_module():
+    """Unload a module's compiled programs after it.
+
+    Every loaded program keeps several memory maps, a process may have 65,530 of them (vm.max_map_count), and a test
+    run compiles thousands of programs: past the limit the next load is a segmentation fault.
+    """
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> pathlib.Path:
     if not DATA.is_dir():
