@@ -50,6 +50,13 @@ class Control(eqx.Module):
         """The control's value in each frame [rad]."""
         return self.basis(jnp.clip(points, self.lower, self.upper))
 
+    def signal_on_host(self, points: Float[AnyArray, " points"]) -> Float[np.ndarray, " frames"]:
+        """`signal` in double precision whatever JAX's mode is, without compiling anything for each length of clip."""
+        clamped = np.clip(np.asarray(points, float), np.asarray(self.lower), np.asarray(self.upper))
+        values = np.asarray(self.basis.values, float)
+        own = np.asarray(self.basis.first)[:, None] + np.arange(values.shape[1])
+        return (clamped[own] * values).sum(axis=1)
+
 
 def turned(
     motion: Motion, controls: tuple[Control, ...], signals: Float[AnyArray, "frames controls"]
@@ -152,15 +159,12 @@ def load_correction(path: str | pathlib.Path) -> Correction:
 
 
 def _turned_on_host(motion: Motion, correction: Correction) -> Float[np.ndarray, "frames joints 4"]:
-    """`turned` in double precision whatever JAX's mode is, without compiling anything for each length of clip."""
+    """`turned`, as `Control.signal_on_host` is `signal`."""
     vectors: dict[int, np.ndarray] = {}
     for control, points in zip(correction.controls, correction.points, strict=True):
-        basis = control.basis
-        clamped = np.clip(np.asarray(points, float), np.asarray(control.lower), np.asarray(control.upper))
-        own = np.asarray(basis.first)[:, None] + np.arange(np.shape(basis.values)[1])
-        signal = (clamped[own] * np.asarray(basis.values, float)).sum(axis=1, keepdims=True)
+        signal = control.signal_on_host(points)
         for drive in control.drives:
-            push = signal * float(drive.gain) * np.asarray(drive.axis_parent, float).reshape(-1, 3)
+            push = signal[:, None] * float(drive.gain) * np.asarray(drive.axis_parent, float).reshape(-1, 3)
             vectors[int(drive.joint)] = vectors.get(int(drive.joint), 0.0) + push
     rotations = np.array(motion.rotations)
     for joint, vector in vectors.items():

@@ -330,9 +330,10 @@ class ZmpDistance(eqx.Module):
     supported: Bool[AnyArray, " frames"]
 
     @property
-    def outside(self) -> Float[Array, " frames"]:
+    def outside(self) -> Float[AnyArray, " frames"]:
         """Distance [m] from the support, 0 inside it and without one."""
-        return jnp.where(self.supported, jnp.maximum(self.signed, 0.0), 0.0)
+        xp = np if isinstance(self.signed, np.ndarray) else jnp  # NumPy compiles nothing for a clip's length
+        return xp.where(self.supported, xp.maximum(self.signed, 0.0), 0.0)
 
 
 def zmp_distance(

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 import motionfit as mf
+from benchmarks.metrics import compilations
 from motionfit import samples
 from motionfit._motion import joint_angles
 from motionfit.adapt._clearance import build_clearance, support
 from motionfit.adapt._limbs import _own_sets, _stages
 from motionfit.metrics import derivative_ratio, skin_depths
+from motionfit.shape.growth import grow
 from motionfit.shape.pairs import pairs_of
 
 pytestmark = pytest.mark.slow
@@ -47,6 +49,13 @@ def test_adapting_again_changes_nearly_nothing(fitted, heavy, average):
     again = mf.adapt(fitted.motion, heavy, reference=average)
     assert joint_angles(again.motion, fitted.motion).max() < np.deg2rad(0.1)
     assert np.abs(np.asarray(again.motion.root) - np.asarray(fitted.motion.root)).max() < 1e-4
+
+
+def test_another_length_or_girth_compiles_nothing(fitted, heavy, average):
+    """Of one bucket. A thousand clips in one process would else hold more programs than it may have memory maps."""
+    walk, girth = samples.walk(cycles=2), grow(heavy, {"trunk": 1.05})
+    for clip, body in ((walk[:-7], heavy), (walk[3:-2], girth)):
+        assert compilations(lambda clip=clip, body=body: mf.adapt(clip, body, reference=average).status) == 0
 
 
 def test_a_clip_that_penetrates_nothing_comes_back(average):

@@ -23,7 +23,7 @@ def recorded(name: str, motion: Motion, base: Motion, correction: Correction, jo
         for control, some in zip(correction.controls, correction.points, strict=True):
             for drive in control.drives:
                 if int(drive.joint) == joint:
-                    signal = np.asarray(control.signal(some), float) * float(drive.gain)
+                    signal = control.signal_on_host(some) * float(drive.gain)
                     missing = missing - signal[:, None] * np.asarray(drive.axis_parent, float).reshape(-1, 3)
         angle = np.linalg.norm(missing, axis=1)
         axis = missing / np.maximum(angle, 1e-12)[:, None]
