@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from motionfit._motion import Motion, bind_pose, host_kinematics, rest_motion
+from motionfit._motion import Motion, bind_pose, rest_motion
 from motionfit.feet._classics import foot_joints
 from motionfit.feet._cycles import Constraint, find_constraints
 from motionfit.feet._floor import Floor
-from motionfit.feet._leg import Leg, find_legs
+from motionfit.feet._leg import Leg, find_legs, leg_kinematics
 from motionfit.feet._plants import Footplants
 from motionfit.feet._sole import Sole, sole_paths
 from motionfit.ik import Task, move_limb, prioritized
@@ -150,7 +150,7 @@ def enforce(
     Returns the motion, which heels could be brought to their goals, and details.
     """
     skeleton, dt = base.skeleton, float(base.dt)
-    positions, rotations = host_kinematics(base)
+    positions, rotations = leg_kinematics(base)
     joints = foot_joints(skeleton)
     standing = bind_pose(skeleton)[0][:, 1] - sole_paths(sole, rest_motion(skeleton))[0, :, 1].min()
     constraints = find_constraints(base, floor, plants=plants.plants, standing=standing, resting=RESTING)
@@ -274,7 +274,7 @@ def _turn_leg(
         knee = (found.upper.inv() * found.lower).as_rotvec()
         values[busy, 3] = np.einsum("fa,fa->f", knee, some.knee_axis)
         values[busy] = prioritized(chain_tasks(some, [p[busy] for p in paths]), values[busy], lower=lower[busy],
-                                   upper=upper[busy])  # fmt: skip
+                                   upper=upper[busy], tolerance=1e-2 * REACHED)  # fmt: skip
         turns = chain_pose(some, values[busy])[:3]
         worlds = {j: Rotation.from_quat(rotations[busy, j], scalar_first=True)
                   for j in (base.skeleton.parents[thigh], thigh, base.skeleton.parents[calf], calf,

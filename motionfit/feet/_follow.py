@@ -9,9 +9,9 @@ planted foot steps as in the source, wherever it stands, and thigh and shank are
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from motionfit._motion import Motion, host_kinematics
+from motionfit._motion import Motion
 from motionfit.feet._detect import smooth
-from motionfit.feet._leg import CALM, find_legs, lowering, pass_over, turn_legs
+from motionfit.feet._leg import CALM, find_legs, leg_kinematics, lowering, pass_over, turn_legs
 from motionfit.feet._plants import runs
 from motionfit.feet._sole import Sole
 
@@ -45,7 +45,7 @@ def follow_feet(
         if plants:
             for axes, anywhere in (([0, 2], True), ([1], False)):
                 moves[:, foot, axes] = pass_over(moves[:, foot, axes], plants, dt, anywhere=anywhere)
-    positions, rotations = host_kinematics(motion)
+    positions, rotations = leg_kinematics(motion)
     targets = [leg.ankle + moves[:, f] for f, leg in enumerate(find_legs(motion.skeleton, positions, rotations))]
     # the root takes what both feet ask for on the whole, and comes down where a leg is too short
     calm = 2 * round(CALM / dt / 2) + 1

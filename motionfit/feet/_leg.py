@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from motionfit._motion import Motion, bind_pose, host_kinematics
 from motionfit._skeleton import SIDES, Skeleton
+from motionfit.feet._classics import foot_joints
 from motionfit.feet._detect import smooth
 from motionfit.feet._floor import Floor
 from motionfit.feet._plants import Footplants, runs
@@ -62,6 +63,13 @@ def hip_from_foot(
     turned = Rotation.from_quat(turn_world, scalar_first=True) * foot.inv()
     place = place_world + turned.apply(positions[:, 0] - positions[:, joint])
     return place, (turned * root).as_quat(scalar_first=True)
+
+
+def leg_kinematics(
+    motion: Motion,
+) -> tuple[Float[np.ndarray, "frames joints 3"], Float[np.ndarray, "frames joints 4"]]:
+    """World positions [m] and rotations of the joints from the root to the toes, NaN elsewhere: a third of the work."""
+    return host_kinematics(motion, [joint for foot in foot_joints(motion.skeleton) for joint in foot])
 
 
 def find_legs(skeleton: Skeleton, positions: np.ndarray, rotations: np.ndarray) -> list[Leg]:
@@ -226,7 +234,7 @@ def calm_feet(motion: Motion, rows: Int[np.ndarray, "frames 2"]) -> Motion:
     """
     skeleton, dt = motion.skeleton, float(motion.dt)
     local, width = np.array(motion.rotations, float), 2 * round(TREMOR / dt / 2) + 1
-    world = host_kinematics(motion)[1]
+    world = leg_kinematics(motion)[1]
     for foot, side in enumerate(SIDES):
         ankle, toe = skeleton.joint(f"{side}_foot"), skeleton.find(f"{side}_toe")
         turned = world[:, ankle].copy()
@@ -281,7 +289,7 @@ def with_leg_ik(
     else:
         moved[:, 1] = floor.at(moved) + plants.floor.above(root)
     shift = moved - root
-    positions, rotations = host_kinematics(base)
+    positions, rotations = leg_kinematics(base)
     moves = hold_feet(paths + shift[:, None], rows, speed, sole, floor, dt)
     legs = find_legs(base.skeleton, positions + shift[:, None], rotations)
     targets = [leg.ankle + moves[:, side] for side, leg in enumerate(legs)]
