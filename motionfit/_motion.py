@@ -1,5 +1,7 @@
 """A motion over time, and the kinematics that everything else reads."""
 
+from collections.abc import Iterable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -274,15 +276,19 @@ def _padded_levels(parents: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np
 
 
 def host_kinematics(
-    motion: Motion,
+    motion: Motion, joints: Iterable[int] | None = None
 ) -> tuple[Float[np.ndarray, "frames joints 3"], Float[np.ndarray, "frames joints 4"]]:
     """World positions [m] and rotations in double precision whatever JAX's mode is, without compiling anything:
-    for files, set-up and measures."""
+    for files, set-up and measures. Of all joints, or of `joints` and those above them: the others are NaN then."""
     skeleton, rotations = motion.skeleton, np.asarray(motion.rotations, float)
     offsets = np.asarray(skeleton.offsets, float)
-    positions, world = np.empty((*rotations.shape[:2], 3)), np.empty_like(rotations)
-    turned: list[Rotation] = []
-    for joint, parent in enumerate(skeleton.parents):
+    positions, world = np.full((*rotations.shape[:2], 3), np.nan), np.full_like(rotations, np.nan)
+    needed = np.ones(len(skeleton.parents), bool)
+    if joints is not None:
+        needed = _ancestors(tuple(skeleton.parents))[list(joints)].any(0)
+    turned: dict[int, Rotation] = {}
+    for joint in np.flatnonzero(needed).tolist():
+        parent = skeleton.parents[joint]
         turn = Rotation.from_quat(rotations[:, joint], scalar_first=True)
         if parent < 0:
             positions[:, joint] = np.asarray(motion.root, float)
@@ -290,7 +296,7 @@ def host_kinematics(
             offset = offsets[joint] if motion.translations is None else np.asarray(motion.translations, float)[:, joint]
             positions[:, joint] = positions[:, parent] + turned[parent].apply(offset)
             turn = turned[parent] * turn
-        turned.append(turn)
+        turned[joint] = turn
         world[:, joint] = turn.as_quat(scalar_first=True)
     return positions, world
 

@@ -52,23 +52,22 @@ ax.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 0.98), ncols=2)
 # ## Three methods
 #
 # `root` moves the root and leaves all rotations as they are (the very same array); `leg-ik` also bends the legs, so
-# that both feet can stand at once; `adaptive` holds ankle and toe joints where thresholds that adapt to the clip say
-# that they rest, so its plants are others. The table gives what the carrying foot slides in all, by the plants found
-# above, before and after, and by the method's own plants after; how far the root went; and the price: the largest
-# turn of a joint, and the jerk of the joints over that of the clip.
+# that both feet can stand at once; `adaptive` then also holds ankle and toe joints where thresholds that adapt to the
+# clip say that they rest. The table gives what the carrying foot slides in all, by the plants found above, before and
+# after; how far the root went; and the price: the largest turn of a joint, and the jerk of the joints over that of the
+# clip.
 
 # %%
 fits, slides = {}, {"before": mf.feet.measure_feet(body, base, plants)["slide_path_m"]}
-print(f"{'':<9} {'slides':>14} {'own plants':>11} {'root moved':>11} {'joint turned':>13} {'jerk':>5} {'time':>8}")
+print(f"{'':<9} {'slides':>14} {'root moved':>11} {'joint turned':>13} {'jerk':>5} {'time':>8}")
 for method in mf.feet.METHODS:
     started = time.perf_counter()
     fit = fits[method] = mf.remove_footskate(clip, body, method)
     took = time.perf_counter() - started
     slides[method] = mf.feet.measure_feet(body, fit.motion, plants)["slide_path_m"]
-    own = fit.measure(fit.motion)["slide_path_m"]
     root = np.linalg.norm(np.asarray(fit.motion.root) - np.asarray(fit.base.root), axis=1).max()
     turned = np.rad2deg(joint_angles(fit.motion, fit.base).max())
-    print(f"{method:<9} {100 * slides['before']:4.1f} -> {100 * slides[method]:3.1f} cm {100 * own:8.1f} cm "
+    print(f"{method:<9} {100 * slides['before']:4.1f} -> {100 * slides[method]:3.1f} cm "
           f"{100 * root:8.1f} cm {turned:9.1f} deg {derivative_ratio(fit.motion, fit.base, 3):5.2f} {1000 * took:5.0f} ms")  # fmt: skip
 print("root: the same rotations:", fits["root"].motion.rotations is fits["root"].base.rotations)
 

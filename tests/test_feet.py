@@ -32,7 +32,7 @@ from motionfit.feet import (
     transfer_instant,
     vertical_scale,
 )  # fmt: skip
-from motionfit.feet._detect import smooth, two_state_path
+from motionfit.feet._detect import _without_fast_ends, smooth, two_state_path
 from motionfit.feet._plants import runs
 from motionfit.feet._transfer import evaluate, integral
 from motionfit.metrics import posed_vertices
@@ -389,6 +389,20 @@ def test_two_state_path_is_the_best_of_all(evidence, cost):
     ]
     found = two_state_path(np.array(evidence), cost).tolist()
     assert gains[every.index(found)] == pytest.approx(max(gains), abs=1e-9)
+
+
+def test_a_foot_that_is_off_already_is_not_down(average):
+    """Averaged speeds and the cost of a change let a plant last a frame or two too long, or begin too early."""
+    sole, frames = find_sole(average), 20
+    rows = sole.of(0)[0], sole.of(1)[0]
+    paths = np.zeros((frames, len(sole.vertices), 3))
+    paths[:, rows[0], 0] = np.cumsum([0, 0.03, 0.02, *[0.001] * 6, 0.03, *[0.001] * 8, 0.02, 0.05])
+    vertex = np.tile(sole.vertices[list(rows)], (frames, 1))
+    vertex[:2, 1] = vertex[15:, 1] = -1
+    found = _without_fast_ends(sole, paths, vertex, 0.01)
+    # a plant is not split: the fast step amid it stays
+    assert runs(found[:, 0] >= 0) == [(2, 17)] and runs(found[:, 1] >= 0) == [(2, 14)]
+    np.testing.assert_array_equal(found[found >= 0], vertex[found >= 0])
 
 
 def test_smoothing_keeps_straight_lines_and_short_clips():

@@ -30,7 +30,7 @@ from motionfit.feet._enforce import (
     descending_step,
     effector_path,
 )
-from motionfit.feet._leg import _clearing, calm_feet
+from motionfit.feet._leg import _clearing, calm_feet, pass_over
 from motionfit.metrics import derivative_ratio
 from tests.helpers import jumping, random_motion, with_legs
 
@@ -226,6 +226,45 @@ def test_leg_ik_holds_both_feet_exactly_without_snapping(heavy):
     assert (a.inv() * b).magnitude().max() < np.radians(2)
 
 
+@pytest.mark.parametrize("scale", [1.2, 1.4])
+def test_a_sole_that_hangs_on_the_shank_holds_where_the_weight_goes_over_to_another_vertex(average, scale):
+    """The next vertex has moved with the shank's skin by then: both have to be where the last step left them."""
+    body = with_legs(average, scale)
+    found = mf.remove_footskate(samples.walk(cycles=2), body, "leg-ik")
+    assert found.status == "converged"
+    assert found.measure(found.motion)["slide_max_m_s"] * found.plants.dt < 1e-5
+
+
+def test_between_plants_a_foot_goes_the_calmest_way():
+    frames, dt = 180, 1 / 60
+    time = np.arange(frames)
+    steps = np.where(time < 80, -0.001, -0.002)[:, None] * np.ones(2)
+    plants = [(30, 60), (110, 140)]
+    held = np.zeros((frames, 2))
+    for start, end in plants:
+        held[start : end + 1] = steps[start : end + 1] * (time[start : end + 1] - start)[:, None]
+    moved = pass_over(held, plants, dt, anywhere=True)
+    for start, end in plants:  # what holds a vertex is kept to the last digit, from a place near the foot's own
+        np.testing.assert_allclose(np.diff(moved[start : end + 1], axis=0), np.diff(held[start : end + 1], axis=0),
+                                   atol=1e-12)  # fmt: skip
+        assert np.abs(moved[start : end + 1].mean(0)).max() < 0.01
+    # speeds of 1 and 2 mm per frame are taken up and given back over more than ten frames, and nothing is left then
+    assert np.abs(np.diff(moved, 2, axis=0)).max() < 0.5 * 0.002
+    assert np.abs(moved[[0, 85, -1]]).max() < 0.15 * np.abs(moved).max()
+    np.testing.assert_array_equal(pass_over(held, plants, dt, anywhere=False)[30:61], held[30:61])
+
+
+def test_plants_with_a_blink_between_them_come_together():
+    """A foot that drifts by 6 cm and blinks twice: each plant held amid its own drift would be thrown 2 cm between."""
+    frames, plants = 120, [(0, 39), (42, 79), (82, 119)]
+    drift = 0.0005 * np.arange(frames)[:, None]
+    held = np.zeros((frames, 1))
+    for start, end in plants:
+        held[start : end + 1] = drift[start] - drift[start : end + 1]
+    path = drift + pass_over(held, plants, 1 / 120, anywhere=True)
+    assert np.abs(np.diff(path, axis=0)).max() < 0.005 and np.abs(np.diff(path, 2, axis=0)).max() < 0.002
+
+
 def test_trembling_feet_are_calmed_where_they_stand(average):
     """A standing body whose feet tremble by a degree: the tremor goes, what is in the air stays bit for bit."""
     rng = np.random.default_rng(4)
@@ -350,6 +389,47 @@ def test_adaptive_holds_heel_and_toe(body, request):
     assert jump[0] < jump[1] + 0.05 * fastest
 
 
+@pytest.mark.parametrize("scale", [0.7, 0.85, 1.0, 1.4])
+def test_adaptive_never_makes_the_detected_plants_slide_more(average, scale):
+    """The walk's feet roll and hardly slide: to hold joints that only pass by would make them slide twice as far."""
+    body = with_legs(average, scale)
+    motion = mf.onto(samples.walk(cycles=3), body.skeleton)
+    plants = mf.detect_footplants(motion, body)
+    found = mf.remove_footskate(motion, body, "adaptive")
+    before, after = (mf.feet.measure_feet(body, m, plants) for m in (motion, found.motion))
+    assert after["slide_path_m"] < before["slide_path_m"]
+    assert after["slide_p95_m_s"] < max(before["slide_p95_m_s"], 0.03)
+    # its own report speaks of the same plants
+    np.testing.assert_array_equal(found.plants.planted, plants.planted)
+    assert found.measure(found.motion)["slide_path_m"] == pytest.approx(after["slide_path_m"])
+
+
+@pytest.mark.parametrize("method", ["root", "leg-ik", "adaptive"])
+def test_status_says_when_a_planted_foot_still_slides(average, method):
+    body = with_legs(average, 1.4)
+    walk = samples.walk(cycles=1)
+    skating = mf.Motion(body.skeleton, walk.root, walk.rotations, walk.dt)
+    found = mf.remove_footskate(skating, body, method)
+    slides = found.measure(found.motion)["slide_max_m_s"] * found.plants.dt
+    assert found.status == ("converged" if slides <= 1e-3 else "violations_left")
+    nothing_done = eqx.tree_at(lambda f: f.motion, found, found.base)
+    assert nothing_done.status == "violations_left"
+
+
+def test_a_joint_that_passes_by_is_not_held(average):
+    walk = samples.walk(cycles=3)
+    every, resting = find_constraints(walk), find_constraints(walk, resting=0.2)
+    assert 0 < len(resting) <= len(every)
+    joints = [[walk.skeleton.joint(f"{s}_{r}") for r in ("foot", "toe")] for s in ("left", "right")]
+    positions = host_kinematics(walk)[0]
+    for found, slow in ((every, False), (resting, True)):
+        fastest = [
+            np.linalg.norm(np.diff(positions[c.start : c.end + 1, joints[c.foot][c.part]], axis=0)[:, [0, 2]], axis=1)
+            for c in found
+        ]
+        assert (max(f.max() for f in fastest if len(f)) < 0.25 * float(walk.dt)) == slow
+
+
 def test_a_heel_that_never_comes_down_is_not_held(average):
     """On tiptoe (8) would still find a constraint for the heel, and put it on the floor."""
     walk = samples.walk(cycles=3)
@@ -428,7 +508,7 @@ def test_command_writes_clip_report_labels_and_picture(method, monkeypatch, caps
     data = json.loads(report.read_text())
     assert data["schema"] == 1 and data["status"] == "converged" and data["footskate"]["method"] == method
     before, after = data["before"]["feet"], data["after"]["feet"]
-    assert after["slide_path_m"] <= before["slide_path_m"] or method == "adaptive"
+    assert after["slide_path_m"] <= before["slide_path_m"]
     assert set(before) >= {"slide_max_m_s", "slide_p95_m_s", "slide_path_m", "contact_frames", "ground_penetration_max_m",
                            "floating_max_m"}  # fmt: skip
     assert len(load_labels(labels, data["frames"], 1 / 60)) > 6
@@ -513,7 +593,7 @@ def test_a_swinging_foot_is_led_over_the_floor_without_a_kink():
 
 
 def test_knees_do_not_snap_where_feet_land(shared_data, male):
-    for name in ("16_05_forward_jump", "16_36_run"):
+    for name in ("16_05_forward_jump", "16_36_run", "16_01_jump"):
         found = mf.remove_footskate(mf.load_motion(shared_data / "bvh" / f"{name}.bvh"), male, "leg-ik")
         after, before = (knee_accelerations(m) for m in (found.motion, found.base))
         assert after.max() < 1.2 * before.max() and after.mean() < 1.2 * before.mean(), name
@@ -524,3 +604,16 @@ def test_leg_ik_on_walks_runs_and_jumps(shared_data, male):
     for name in ("02_01_walk", "16_36_run", "16_05_forward_jump", "05_03_dance_folding_arms"):
         found = mf.remove_footskate(mf.load_motion(shared_data / "bvh" / f"{name}.bvh"), male, "leg-ik")
         assert found.status == "converged" and (derivative_ratio(found.motion, found.base, 2) or 9.0) < 1.2, name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [0.7, 1.0, 1.4])
+def test_adaptive_on_every_locomotion_clip(shared_data, male, scale):
+    body = with_legs(male, scale)
+    for path in sorted((shared_data / "locomotion").glob("*.bvh")):
+        motion = mf.onto(mf.load_motion(path), body.skeleton)
+        plants = mf.detect_footplants(motion, body)
+        found = mf.remove_footskate(motion, body, "adaptive")
+        before, after = (mf.feet.measure_feet(body, m, plants) for m in (motion, found.motion))
+        assert after["slide_path_m"] < 0.5 * before["slide_path_m"], path.name
+        assert found.details["ankle_error_max_m"] < 1e-4 and found.details["toe_error_max_m"] < 0.01, path.name

@@ -24,8 +24,14 @@ def test_forward_kinematics_agrees_with_matrix_products(arguments):
         oracle = matrices(motion, frame)
         np.testing.assert_allclose(kin.positions_world[frame], oracle[:, :3, 3], atol=EXACT)
         np.testing.assert_allclose(mf.rotation.to_matrix(kin.rotations_world[frame]), oracle[:, :3, :3], atol=EXACT)
-    positions, _ = host_kinematics(motion)
+    positions, rotations = host_kinematics(motion)
     np.testing.assert_allclose(positions, kin.positions_world, atol=EXACT)
+    # of the last joint and those above it alone
+    some, turned = host_kinematics(motion, [len(motion.skeleton.names) - 1])
+    there = np.isfinite(some[0, :, 0])
+    assert there[[0, -1]].all()
+    np.testing.assert_array_equal(some[:, there], positions[:, there])
+    np.testing.assert_array_equal(turned[:, there], rotations[:, there])
 
 
 @given(motions)

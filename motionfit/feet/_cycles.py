@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float
 from motionfit._motion import Motion
 from motionfit._skeleton import SIDES
 from motionfit.feet._classics import foot_joints
-from motionfit.feet._detect import ADULT_LEG, leg_scale, smooth, velocity
+from motionfit.feet._detect import ADULT_LEG, leg_scale, smooth, smoothing_frames, velocity
 from motionfit.feet._floor import Floor
-from motionfit.feet._plants import Plant
+from motionfit.feet._plants import Plant, runs
 from motionfit.feet._sole import chain_kinematics
 
 CYCLE = 25  # frames of the source's normalised cycle
@@ -25,6 +25,7 @@ BOUNDS = {"walk": ((1, 12), (3, 15)), "run": ((1, 7), (1, 9))}
 CORRECTNESS = 0.4  # delta of (8)
 NOISE = 0.01  # [m] by which the height of a joint varies while its foot stands
 RAISED = 0.04  # [m] for an adult's leg
+BRIEF = 0.05  # [s] a joint that rests for less is on its way
 RUNNING = 0.5  # Froude number v^2 / g L from which people run (Alexander 1989)
 
 
@@ -83,6 +84,7 @@ def find_constraints(
     *,
     plants: Sequence[Plant] = (),
     standing: Float[np.ndarray, " joints"] | None = None,
+    resting: float | None = None,
     correctness: float = CORRECTNESS,
 ) -> list[Constraint]:
     """Ankle and toe constraints of both feet by the adaptive threshold, without a kind of motion named.
@@ -92,12 +94,17 @@ def find_constraints(
     far as nothing better is known: `plants` keep the bounding frames within the foot's own plants, and one that no
     strike explains bounds an interval of its own. (8) finds a constraint wherever it is asked to: where `standing` says
     how high [m] over the floor each joint is in a foot that stands flat, a joint that stays `RAISED` above that (a
-    heel on tiptoe, or at the end of the clip) has none.
+    heel on tiptoe, or at the end of the clip) has none. Nor does a height say that a joint rests: a foot that turns
+    on its toes, or comes down on its heel, has a low ankle that moves. `resting` [m/s] leaves of each constraint the
+    longest part in which the joint is slower, over the floor, unless that is brief.
     """
     floor = floor or Floor()
     frames, joints = motion.frame_count, foot_joints(motion.skeleton)
     world = chain_kinematics(motion, tuple(j for foot in joints for j in foot))
     heights = [[floor.above(world[j][1]) for j in foot] for foot in joints]
+    dt = float(motion.dt)
+    calm = [[smooth(world[j][1] - world[j][1][0], smoothing_frames(dt)) for j in foot] for foot in joints]
+    pace = [[np.linalg.norm(velocity(path, dt)[:, [0, 2]], axis=1) for path in foot] for foot in calm]
     most = None if standing is None else np.asarray(standing) + RAISED * leg_scale(motion.skeleton)
     moments = strikes(motion)
     constraints: list[Constraint] = []
@@ -113,7 +120,11 @@ def find_constraints(
         mine = heights[foot][part][first : last + 1]
         if most is None or mine.min() < most[joints[foot][part]]:
             a, b = adaptive_threshold(mine, correctness)
-            constraints.append(Constraint(foot, part, first + a, first + b))
+            slow = runs(pace[foot][part][first + a : first + b + 1] <= (np.inf if resting is None else resting))
+            if slow:
+                start, end = max(slow, key=lambda run: run[1] - run[0])
+                if resting is None or end - start >= BRIEF / dt:
+                    constraints.append(Constraint(foot, part, first + a + start, first + a + end))
 
     if len(moments) < 2:
         moments = []

@@ -243,9 +243,7 @@ def choose_primary(
     dt: float,
 ) -> Int[np.ndarray, " frames"]:
     """The foot that carries: where both are down, the way of least slide between single supports (Viterbi)."""
-    row_of = np.zeros(int(sole.vertices.max()) + 1, int)
-    row_of[sole.vertices] = np.arange(len(sole.vertices))
-    speed = np.take_along_axis(evidence.speed, row_of[np.maximum(vertex, 0)], axis=1)
+    speed = np.take_along_axis(evidence.speed, _rows(sole, vertex), axis=1)
     # positive where the right foot slides less; single supports leave no choice
     lead = (speed[:, 0] - speed[:, 1]) * dt
     lead = np.where(planted.all(1), lead, np.where(planted[:, 1], 1e3, np.where(planted[:, 0], -1e3, 0.0)))
@@ -253,12 +251,42 @@ def choose_primary(
     return np.where(planted.any(1), right.astype(int), -1)
 
 
+def _rows(sole: Sole, vertex: Int[np.ndarray, "frames 2"]) -> Int[np.ndarray, "frames 2"]:
+    """Rows of the sole for vertices of the mesh; any row where there is none (-1)."""
+    row_of = np.zeros(int(sole.vertices.max()) + 1, int)
+    row_of[sole.vertices] = np.arange(len(sole.vertices))
+    return row_of[np.maximum(vertex, 0)]
+
+
 def detect(sole: Sole, motion: Motion, floor: Floor | None = None) -> tuple[Footplants, Evidence]:
     """Footplants of a motion on the sole's own skeleton, with what they were decided on."""
     dt, size = float(motion.dt), leg_scale(sole.skeleton)
     evidence = gather(sole, motion, floor)
     planted, confidence = _labels(evidence, dt, size)
-    return assemble(sole, evidence, planted, confidence, dt), evidence
+    vertex = choose_vertices(sole, evidence, planted, dt)
+    root = np.asarray(motion.root, float)
+    paths = evidence.paths_world + (evidence.path_scale - 1.0) * (root * [1.0, 0.0, 1.0])[:, None]
+    vertex = _without_fast_ends(sole, paths, vertex, STILL * size * dt)
+    planted = vertex >= 0
+    primary = choose_primary(sole, evidence, planted, vertex, dt)
+    return Footplants(planted, vertex, confidence, primary, evidence.floor, dt), evidence
+
+
+def _without_fast_ends(
+    sole: Sole, paths: Float[np.ndarray, "frames soles 3"], vertex: Int[np.ndarray, "frames 2"], still: float
+) -> Int[np.ndarray, "frames 2"]:
+    """The vertices stood on, less the frames at both ends of a plant in whose step to the next one the vertex goes
+    further than `still` [m]: the labels are decided on averages of a few frames, which see a foot leave too late."""
+    rows, vertex = _rows(sole, vertex), vertex.copy()
+    for foot in (0, 1):
+        for start, end in runs(vertex[:, foot] >= 0):
+            at = np.arange(start, end)
+            steps = [(paths[at + 1, v] - paths[at, v])[:, [0, 2]] for v in (rows[at, foot], rows[at + 1, foot])]
+            calm = np.flatnonzero(np.linalg.norm(steps, axis=-1).min(0) <= still)
+            if len(calm):
+                vertex[start : start + calm[0], foot] = -1
+                vertex[start + calm[-1] + 2 : end + 1, foot] = -1
+    return vertex
 
 
 def assemble(sole, evidence: Evidence, planted, confidence, dt: float, vertex=None) -> Footplants:

@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from motionfit._motion import Motion, bind_pose, host_kinematics, rest_motion
+from motionfit._motion import Motion, bind_pose, rest_motion
 from motionfit.feet._classics import foot_joints
 from motionfit.feet._cycles import Constraint, find_constraints
 from motionfit.feet._floor import Floor
-from motionfit.feet._leg import Leg, find_legs, lowering
+from motionfit.feet._leg import Leg, find_legs, leg_kinematics
 from motionfit.feet._plants import Footplants
 from motionfit.feet._sole import Sole, sole_paths
 from motionfit.ik import Task, move_limb, prioritized
@@ -20,6 +20,7 @@ KNEE = (0.0, 2.7)  # [rad] how far a knee bends
 ANKLE = 1.2  # [rad] how far the ankle may be turned away from the clip, about each of its axes
 HIP = 1.0  # [rad] and the hip
 REACHED = 1e-4  # [m]
+RESTING = 0.03  # [m/s] a joint of a standing foot that moves faster does not rest: half a millimetre in 1/60 s
 
 
 def descending_step(t: Float[np.ndarray, "..."] | float) -> Float[np.ndarray, "..."] | float:
@@ -133,56 +134,48 @@ def chain_tasks(chain: Chain, goals: list[Float[np.ndarray, "batch 3"]]) -> list
 
 
 def enforce(
-    base: Motion, sole: Sole, plants: Footplants, target: Floor | None = None, lift: float | None = None
-) -> tuple[Motion, Bool[np.ndarray, "frames 2"], Bool[np.ndarray, "frames 2"], dict[str, float]]:
+    base: Motion, sole: Sole, plants: Footplants, floor: Floor
+) -> tuple[Motion, Bool[np.ndarray, "frames 2"], dict[str, float]]:
     """Heel and toe of both feet held where adaptive thresholds find them constrained.
 
     Per leg a chain of six degrees of freedom from hip to toe and two positional effectors: the ankle first, then
     the toe, by prioritized inverse kinematics with damping and joint limits (5.1). Their paths are (9). A goal is
-    the effector's mean place over its constraint (the source takes the one at its beginning), put at the height over
-    the floor that the joint has in the bind pose. Where only one of both is held the other's path is drawn to the foot's length from it, so
-    that both can be met. The character comes down where a leg is too short.
+    the effector's mean place over its constraint (the source takes the one at its beginning). Where only one of both
+    is held the other's path is drawn to the foot's length from it, so that both can be met.
 
-    Returns the motion, which feet are held by heel or toe, which heels could be brought to their goals, and details.
+    The source's cycles do not skate; a clip may, and a goal that its foot only slides through would make it slide
+    more. So `base` is a motion whose planted feet stand still already (`with_leg_ik`), and only a joint that is
+    at rest there (`RESTING`) is held: a foot rolls over its heel and toes as before.
+
+    Returns the motion, which heels could be brought to their goals, and details.
     """
     skeleton, dt = base.skeleton, float(base.dt)
-    floor = plants.floor if target is None else target
-    positions, rotations = host_kinematics(base)
-    if target is not None:
-        # the clip's floor is laid on the target's
-        rise = target.at(positions[:, 0]) - plants.floor.at(positions[:, 0])
-        positions = positions + np.array([0.0, 1.0, 0.0]) * rise[:, None, None]
+    positions, rotations = leg_kinematics(base)
     joints = foot_joints(skeleton)
     standing = bind_pose(skeleton)[0][:, 1] - sole_paths(sole, rest_motion(skeleton))[0, :, 1].min()
-    constraints = find_constraints(base, plants.floor, plants=plants.plants, standing=standing)
+    constraints = find_constraints(base, floor, plants=plants.plants, standing=standing, resting=RESTING)
     ease = max(1, round(EASE / dt))
     paths, goals = [], []
     for side, mine in enumerate(joints):
-        goals.append(_goals([c for c in constraints if c.foot == side], mine, positions, standing, floor, ease))
+        goals.append(_goals([c for c in constraints if c.foot == side], mine, positions, ease))
         paths.append([effector_path(positions[:, j], goals[side][part], ease) for part, j in enumerate(mine)])
         if len(mine) == 2:
             _keep_foot_length(
                 paths[side][0], paths[side][1], goals[side], positions[:, mine[1]] - positions[:, mine[0]], ease
             )
-    legs = find_legs(skeleton, positions, rotations)
-    down = lowering(legs, [p[0] for p in paths], dt) if lift is None else np.full(base.frame_count, float(lift))
-    positions = positions - np.array([0.0, 1.0, 0.0]) * down[:, None, None]
     local, reachable = np.array(base.rotations, float), np.ones((base.frame_count, 2), bool)
-    held = np.zeros_like(reachable)
     worst = [0.0, 0.0]
     for side, (mine, leg) in enumerate(zip(joints, find_legs(skeleton, positions, rotations), strict=True)):
         errors = _turn_leg(base, leg, mine, positions, rotations, paths[side], local)
         for part, error in enumerate(errors):
             for start, end, _ in goals[side][part]:
-                held[start : end + 1, side] = True
                 worst[part] = max(worst[part], float(error[start : end + 1].max()))
                 if part == 0:
                     reachable[start : end + 1, side] = error[start : end + 1] < REACHED
-    details = {"lowered_max_m": float(down.max()), "constraints": float(len(constraints)),
+    details = {"constraints": float(sum(len(part) for side in goals for part in side)),
                "ankle_error_max_m": worst[0], "toe_error_max_m": worst[1]}  # fmt: skip
-    moved = Motion(skeleton, positions[:, 0].astype(np.asarray(base.root).dtype),
-                   local.astype(np.asarray(base.rotations).dtype), base.dt, base.translations)  # fmt: skip
-    return moved, held, reachable, details
+    moved = Motion(skeleton, base.root, local.astype(np.asarray(base.rotations).dtype), base.dt, base.translations)
+    return moved, reachable, details
 
 
 Goal = tuple[int, int, np.ndarray]
@@ -192,8 +185,6 @@ def _goals(
     constraints: list[Constraint],
     joints: tuple[int, ...],
     positions: np.ndarray,
-    standing: np.ndarray,
-    floor: Floor,
     ease: int,
 ) -> list[list[Goal]]:
     """Per effector of a foot the goals (start, end, position), in order and at least an ease apart."""
@@ -205,7 +196,6 @@ def _goals(
             if start > c.end:
                 continue
             goal = positions[start : c.end + 1, joint].mean(0)
-            goal[1] = floor.at(goal) + standing[joint]
             end = c.end
             if part == 1:
                 heels = [(a, g) for a, b, g in goals[0] if a <= c.end and b >= start]
@@ -284,7 +274,7 @@ def _turn_leg(
         knee = (found.upper.inv() * found.lower).as_rotvec()
         values[busy, 3] = np.einsum("fa,fa->f", knee, some.knee_axis)
         values[busy] = prioritized(chain_tasks(some, [p[busy] for p in paths]), values[busy], lower=lower[busy],
-                                   upper=upper[busy])  # fmt: skip
+                                   upper=upper[busy], tolerance=1e-2 * REACHED)  # fmt: skip
         turns = chain_pose(some, values[busy])[:3]
         worlds = {j: Rotation.from_quat(rotations[busy, j], scalar_first=True)
                   for j in (base.skeleton.parents[thigh], thigh, base.skeleton.parents[calf], calf,

@@ -9,9 +9,9 @@ planted foot steps as in the source, wherever it stands, and thigh and shank are
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from motionfit._motion import Motion, host_kinematics
+from motionfit._motion import Motion
 from motionfit.feet._detect import smooth
-from motionfit.feet._leg import CALM, find_legs, lowering, pass_over, turn_legs
+from motionfit.feet._leg import CALM, find_legs, leg_kinematics, lowering, pass_over, turn_legs
 from motionfit.feet._plants import runs
 from motionfit.feet._sole import Sole
 
@@ -40,13 +40,12 @@ def follow_feet(
         for start, end in plants:
             part, at, standing = slice(start, end + 1), np.arange(start, end), rows[start : end + 1, foot]
             halves = [missing[at + 1, v] - missing[at, v] for v in (standing[:-1], standing[1:])]
-            held = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (halves[0] + halves[1]), axis=0)])
-            held -= held.mean(0)
-            held[:, 1] = source_world[part, mine, 1].min(1) - paths_world[part, mine, 1].min(1)
-            moves[part, foot] = held
+            moves[start + 1 : end + 1, foot] = np.cumsum(0.5 * (halves[0] + halves[1]), axis=0)
+            moves[part, foot, 1] = source_world[part, mine, 1].min(1) - paths_world[part, mine, 1].min(1)
         if plants:
-            pass_over(moves[:, foot], plants, dt)
-    positions, rotations = host_kinematics(motion)
+            for axes, anywhere in (([0, 2], True), ([1], False)):
+                moves[:, foot, axes] = pass_over(moves[:, foot, axes], plants, dt, anywhere=anywhere)
+    positions, rotations = leg_kinematics(motion)
     targets = [leg.ankle + moves[:, f] for f, leg in enumerate(find_legs(motion.skeleton, positions, rotations))]
     # the root takes what both feet ask for on the whole, and comes down where a leg is too short
     calm = 2 * round(CALM / dt / 2) + 1

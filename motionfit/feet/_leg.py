@@ -11,10 +11,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d, maximum_filter1d
+from scipy.sparse import csr_array, diags_array, eye_array
+from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
 from motionfit._motion import Motion, bind_pose, host_kinematics
 from motionfit._skeleton import SIDES, Skeleton
+from motionfit.feet._classics import foot_joints
 from motionfit.feet._detect import smooth
 from motionfit.feet._floor import Floor
 from motionfit.feet._plants import Footplants, runs
@@ -23,11 +26,11 @@ from motionfit.feet._sole import Sole, sole_paths
 from motionfit.ik import move_limb
 
 CALM = 0.25  # [s] over which the root's correction is averaged, twice: the legs take the rest
-EASE = 0.12  # [s] within which a foot comes to rest and leaves again
+EASE = 0.12  # [s] within which a foot comes to rest and leaves again: half of what the move's curve takes
 EVEN = 0.1  # [s] sigma over which the height of a standing sole is averaged: its noise would go to the knee, and a
 # foot that is still coming down when its plant begins comes to rest as it did, instead of at once
 TREMOR = 0.06  # [s] over which the rotation of a standing foot is averaged
-EXACT = 1e-9  # [m] to which the vertices that stand are brought to their places
+EXACT = 1e-7  # [m] to which the vertices that stand are brought to their places
 STRETCH = 0.99  # of a leg's length: near the end the knee turns by degrees for a millimetre at the foot
 LOWEST = 0.1  # of a leg's length, as far as the character is lowered for the legs' sake
 
@@ -62,6 +65,13 @@ def hip_from_foot(
     return place, (turned * root).as_quat(scalar_first=True)
 
 
+def leg_kinematics(
+    motion: Motion,
+) -> tuple[Float[np.ndarray, "frames joints 3"], Float[np.ndarray, "frames joints 4"]]:
+    """World positions [m] and rotations of the joints from the root to the toes, NaN elsewhere: a third of the work."""
+    return host_kinematics(motion, [joint for foot in foot_joints(motion.skeleton) for joint in foot])
+
+
 def find_legs(skeleton: Skeleton, positions: np.ndarray, rotations: np.ndarray) -> list[Leg]:
     """Both legs of a motion whose world kinematics are given. The knee's axis is the one about which the shank bends
     over the clip, fixed in the thigh; a leg that never bends takes the character's left-right axis at bind."""
@@ -80,6 +90,27 @@ def find_legs(skeleton: Skeleton, positions: np.ndarray, rotations: np.ndarray) 
     return legs
 
 
+def stay(
+    paths: Float[np.ndarray, "frames soles 3"],
+    rows: Int[np.ndarray, "frames 2"],
+    speed: Float[np.ndarray, "frames soles"],
+    sole: Sole,
+    dt: float,
+) -> Float[np.ndarray, "frames 2 3"]:
+    """How far [m] each foot must move horizontally in each frame so that the vertex stood on keeps its place in a
+    plant. The place, and the moves between two plants, are those of the calmest way near to the foot's own."""
+    moves = np.zeros((len(paths), 2, 3))
+    for foot in (0, 1):
+        plants = runs(rows[:, foot] >= 0)
+        if plants:
+            steps = root_steps(paths, rows[:, foot], speed, sole.side)[0][:, [0, 2]]
+            held = np.zeros((len(paths), 2))
+            for start, end in plants:
+                held[start + 1 : end + 1] = np.cumsum(steps[start:end], axis=0)
+            moves[:, foot, [0, 2]] = pass_over(held, plants, dt, anywhere=True)
+    return moves
+
+
 def hold_feet(
     paths: Float[np.ndarray, "frames soles 3"],
     rows: Int[np.ndarray, "frames 2"],
@@ -90,29 +121,20 @@ def hold_feet(
 ) -> Float[np.ndarray, "frames 2 3"]:
     """How far [m] each foot must move in each frame so that it stands still, on the floor, while it is planted.
 
-    In a plant the vertex stood on keeps its horizontal place (chosen so that the foot moves as little as possible on
-    the whole) and the foot's lowest vertex, its height averaged over a moment, is on the floor. Between two plants the
-    move goes over from one to the other, with the speeds that the foot needs to come to rest, and a swinging sole is
-    led over the floor.
+    In a plant the vertex stood on keeps its horizontal place (`stay`) and the foot's lowest vertex, its height averaged
+    over a moment, is on the floor. Between two plants the move goes over from one to the other, with the speeds that
+    the foot needs to come to rest, and a swinging sole is led over the floor.
     """
-    frames = len(paths)
-    moves = np.zeros((frames, 2, 3))
+    moves = stay(paths, rows, speed, sole, dt)
     for foot in (0, 1):
-        mine = sole.of(foot)
-        heights = floor.above(paths[:, mine])
-        lowest = heights.min(1)
-        steps = root_steps(paths, rows[:, foot], speed, sole.side)[0]
-        move = moves[:, foot]
-        plants = runs(rows[:, foot] >= 0)
+        planted, move = rows[:, foot] >= 0, moves[:, foot]
+        lowest, plants = floor.above(paths[:, sole.of(foot)]).min(1), runs(planted)
         for start, end in plants:
-            held = np.concatenate([np.zeros((1, 3)), np.cumsum(steps[start:end], axis=0)])
-            held -= held.mean(0)
             level = gaussian_filter1d(lowest[start : end + 1], EVEN / dt, mode="nearest")
-            held[:, 1] = floor.at(held) - floor.height - level
-            move[start : end + 1] = held
+            move[start : end + 1, 1] = floor.at(move[start : end + 1]) - floor.height - level
         if plants:
-            pass_over(move, plants, dt)
-            move[:, 1] += _clearing(lowest + move[:, 1], rows[:, foot] >= 0, dt)
+            move[:, [1]] = pass_over(move[:, [1]], plants, dt, anywhere=False)
+            move[:, 1] += _clearing(lowest + move[:, 1], planted, dt)
     return moves
 
 
@@ -131,26 +153,32 @@ def _clearing(
     return raised * (3 * s**2 - 2 * s**3)
 
 
-def pass_over(move: Float[np.ndarray, "frames 3"], plants: list[tuple[int, int]], dt: float) -> None:
-    """Fill the frames between plants, in place: the smooth step 3s^2 - 2s^3 from one end to the other, plus what
-    meets the speeds at both ends (the cubic Hermite polynomials of a slope) within the ease."""
-    move[: plants[0][0]] = move[plants[0][0]]
-    move[plants[-1][1] + 1 :] = move[plants[-1][1]]
-    reach = max(1, round(EASE / dt))
-    for (start, end), (after, last) in zip(plants, plants[1:], strict=False):
-        gap = after - end
-        if gap < 2:
-            continue
-        s = np.arange(1, gap)[:, None] / gap
-        filled = move[end] + (3 * s**2 - 2 * s**3) * (move[after] - move[end])
-        width = min(reach, gap)
-        for edge, inner, sign in ((end, max(end - 2, start), 1), (after, min(after + 2, last), -1)):
-            if inner == edge:
-                continue
-            slope = (move[edge] - move[inner]) / (edge - inner)  # per frame
-            at = np.clip(sign * (np.arange(end + 1, after)[:, None] - edge) / width, 0.0, 1.0)
-            filled = filled + sign * width * slope * (at**3 - 2 * at**2 + at)
-        move[end + 1 : after] = filled
+def pass_over(
+    moves: Float[np.ndarray, "frames k"], plants: list[tuple[int, int]], dt: float, *, anywhere: bool
+) -> Float[np.ndarray, "frames k"]:
+    """The moves [m] of all frames, given those of the frames with a plant, start to end.
+
+    The one of least sum |m|^2 + EASE^4 |m''|^2: as near to the foot's own path as it is calm, so that it comes to rest
+    and leaves with the speed that it has, and goes from one plant to the next. `anywhere` leaves open where each
+    plant is, so that only the steps inside it are given: plants with little time between them come together.
+    """
+    frames, planted = len(moves), np.zeros(len(moves), bool)
+    for start, end in plants:
+        planted[start : end + 1] = True
+    given, own = np.where(planted[:, None], moves, 0.0), ~planted
+    if anywhere:
+        own[[start for start, _ in plants]] = True  # one unknown for the whole plant
+    if not own.any():
+        return given
+    open_frames = np.arange(frames) if anywhere else np.flatnonzero(own)
+    share = csr_array((np.ones(len(open_frames)), (open_frames, (np.cumsum(own) - 1)[open_frames])),
+                      shape=(frames, int(own.sum())))  # fmt: skip
+    cost = eye_array(frames, format="csr")
+    if frames > 2:
+        bend = diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(frames - 2, frames))  # pyright: ignore[reportArgumentType]: SciPy's stub
+        cost = cost + (EASE / dt) ** 4 * (bend.T @ bend)
+    found = spsolve((share.T @ cost @ share).tocsc(), -(share.T @ (cost @ given)))
+    return given + share @ found.reshape(-1, moves.shape[1])
 
 
 def lowering(legs: list[Leg], targets: list[Float[np.ndarray, "frames 3"]], dt: float) -> Float[np.ndarray, " frames"]:
@@ -206,7 +234,7 @@ def calm_feet(motion: Motion, rows: Int[np.ndarray, "frames 2"]) -> Motion:
     """
     skeleton, dt = motion.skeleton, float(motion.dt)
     local, width = np.array(motion.rotations, float), 2 * round(TREMOR / dt / 2) + 1
-    world = host_kinematics(motion)[1]
+    world = leg_kinematics(motion)[1]
     for foot, side in enumerate(SIDES):
         ankle, toe = skeleton.joint(f"{side}_foot"), skeleton.find(f"{side}_toe")
         turned = world[:, ankle].copy()
@@ -261,22 +289,24 @@ def with_leg_ik(
     else:
         moved[:, 1] = floor.at(moved) + plants.floor.above(root)
     shift = moved - root
-    positions, rotations = host_kinematics(base)
+    positions, rotations = leg_kinematics(base)
     moves = hold_feet(paths + shift[:, None], rows, speed, sole, floor, dt)
     legs = find_legs(base.skeleton, positions + shift[:, None], rotations)
     targets = [leg.ankle + moves[:, side] for side, leg in enumerate(legs)]
     down = lowering(legs, targets, dt) if lift is None else np.full(base.frame_count, float(lift))
     below = np.array([0.0, 1.0, 0.0]) * down[:, None]
     legs = [leg._replace(hip=leg.hip - below, knee=leg.knee - below, ankle=leg.ankle - below) for leg in legs]
-    wanted = paths + (shift[:, None] + moves[:, sole.side])
+    heights = paths[..., 1] + shift[:, 1:2] + moves[:, sole.side, 1]
     standing = rows >= 0
     dtype = np.asarray(base.root).dtype
     for _ in range(4):
         local, reachable = turn_legs(base, legs, targets, rotations)
         result = Motion(base.skeleton, moved - below, local, base.dt, base.translations)
         # a sole vertex that hangs on the shank's skin too is not yet quite where it should be: once more
-        missing = np.take_along_axis(wanted - sole_paths(sole, result), np.maximum(rows, 0)[..., None], axis=1)
-        missing = np.where((standing & reachable)[..., None], missing, 0.0)
+        now = sole_paths(sole, result)
+        missing = stay(now, rows, speed, sole, dt)
+        missing[..., 1] = np.take_along_axis(heights - now[..., 1], np.maximum(rows, 0), axis=1) * standing
+        missing *= reachable[..., None]
         if np.abs(missing).max() < EXACT:
             break
         targets = [target + missing[:, side] for side, target in enumerate(targets)]

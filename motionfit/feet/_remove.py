@@ -29,8 +29,8 @@ TOLERANCE = 1e-3  # [m] of slide per frame inside a plant: what counts as a viol
 class FootFit(eqx.Module):
     """A motion with its footskate removed.
 
-    `motion` is the result and `base` the clip on the character as it came, `plants` the footplants that were held,
-    and `reachable` says per frame and foot whether a leg could reach where its foot should stand (all True for the
+    `motion` is the result and `base` the clip on the character as it came, `plants` the footplants that were held
+    (by every method), and `reachable` says per frame and foot whether a leg could reach where its foot should stand (all True for the
     root method, which moves no leg).
     """
 
@@ -45,11 +45,10 @@ class FootFit(eqx.Module):
     @property
     def status(self) -> str:
         """ "converged", or "violations_left": a planted vertex still slides over 1 mm in a frame, or a foot could not
-        reach its place; "no_progress" where no foot is ever down, so that nothing could be done. The adaptive method
-        holds joints, not vertices: there only the reach counts."""
+        reach its place; "no_progress" where no foot is ever down, so that nothing could be done."""
         if not self.plants.planted.any():
             return "no_progress"
-        slide = 0.0 if self.method == "adaptive" else self.measure(self.motion)["slide_max_m_s"] or 0.0
+        slide = self.measure(self.motion)["slide_max_m_s"] or 0.0
         left = slide * self.plants.dt > TOLERANCE or not self.reachable.all()
         return "violations_left" if left else "converged"
 
@@ -180,8 +179,8 @@ def remove_footskate(
 
     `method` "root" moves the root alone, and the rotations come back as the very same array (Lyard 2007, thesis
     3.1); "leg-ik" starts the hierarchy at the planted foot and bends the legs so that each foot stands exactly
-    where it should (thesis 3.2); "adaptive" finds heel and toe plants by thresholds that adapt to the clip and
-    enforces them by prioritized inverse kinematics (Glardon 2006).
+    where it should (thesis 3.2); "adaptive" does so too, then finds by thresholds that adapt to the clip when heel
+    and toe joints rest, and holds them by prioritized inverse kinematics (Glardon 2006).
 
     `plants` or `labels` (a CSV file) say when feet are down, else `detect_footplants` does. `floor` is where the
     feet shall stand (a height [m] or a `Floor`); without it they stay on the floor that the clip's contacts show.
@@ -215,10 +214,9 @@ def remove_footskate(
     elif method == "leg-ik":
         result, reachable, details = with_leg_ik(base, sole, plants, paths, rows, speed, target, lift)
     else:
-        result, held, reachable, details = enforce(base, sole, plants, target, lift)
-        # the plants are now those that were enforced; where a foot stands is read off the result
-        evidence = gather(sole, result, plants.floor if target is None else target)
-        plants = assemble(sole, evidence, held, held.astype(float), float(base.dt))
+        still, stands, details = with_leg_ik(base, sole, plants, paths, rows, speed, target, lift)
+        result, reachable, more = enforce(still, sole, plants, plants.floor if target is None else target)
+        reachable, details = reachable & stands, details | more
     if target is not None:
         plants = Footplants(plants.planted, plants.vertex, plants.confidence, plants.primary, target, plants.dt)
     return FootFit(result, base, plants, method, reachable, details, sole)
