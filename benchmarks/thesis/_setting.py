@@ -37,13 +37,18 @@ MODELS: dict[str, Callable[[mf.Character], Masses]] = {
 
 
 def arguments(description: str, *, clips: bool = True) -> argparse.Namespace:
+    return argument_parser(description, clips=clips).parse_args()
+
+
+def argument_parser(description: str, *, clips: bool = True) -> argparse.ArgumentParser:
+    """The options that all scripts know, for those that add some of their own."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=pathlib.Path, help="folder with bvh/*.bvh and characters/*.glb")
     parser.add_argument("--bodies", nargs="*", help="stems in characters/, or built-in names without --data")
     if clips:
         parser.add_argument("--fps", type=float, default=60.0)
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("benchmark_results"))
-    return parser.parse_args()
+    return parser
 
 
 def bodies(options: argparse.Namespace) -> dict[str, mf.Character]:
