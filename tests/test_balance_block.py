@@ -7,6 +7,7 @@ import motionfit as mf
 from motionfit import samples
 from motionfit._control import Control, Correction, Drive
 from motionfit._motion import Motion, continued, host_kinematics, joint_angles, padded
+from motionfit.adapt._controls import lean_controls
 from motionfit.adapt._record import recorded
 from motionfit.metrics import derivative_ratio
 from motionfit.splines import bspline_basis, per_frame
@@ -63,6 +64,37 @@ def test_a_scale_that_makes_cartoons_is_said(average):
         mf.adapt.balance(walk[:1], average, _alone(walk[:1], average), reference=average, scale=0.5)
     with pytest.raises(mf.InputError, match="0 to 2"):
         mf.adapt.balance(walk, average, _alone(walk, average), scale=-1.0)
+
+
+@pytest.mark.parametrize(("gaze", "shoulders"), [(True, True), (True, False), (False, True)])
+def test_a_bent_spine_takes_along_what_is_not_kept(average, gaze, shoulders):
+    """Thesis 5.5.2: the opposite of the spine's turn on head and shoulders keeps their orientation in the world."""
+    walk = mf.onto(samples.walk(cycles=1), average.skeleton)
+    controls = lean_controls(average, walk, bspline_basis(walk.frame_count, float(walk.dt), 0.1), gaze, shoulders)
+    bent = Correction(controls, tuple(np.full(np.shape(p), 0.2 if c.name == "spine_sideways" else 0.0)
+                                      for c, p in zip(controls, Correction.zero(controls).points, strict=True)))  # fmt: skip
+    before, after = (host_kinematics(m)[1] for m in (walk, bent.apply(walk)))
+    joints = [average.skeleton.joint(r) for r in ("chest", "head", "left_upper_arm", "right_forearm")]
+    turned = 2 * np.arccos(np.clip(np.abs((before * after).sum(-1)), 0.0, 1.0))[:, joints]
+    kept = [0.2, 0.2 * (not gaze), 0.2 * (not shoulders), 0.2 * (not shoulders)]
+    np.testing.assert_allclose(turned, np.tile(kept, (len(turned), 1)), atol=0.002)
+
+
+@pytest.mark.slow
+def test_shoulders_stay_while_the_body_leans(leaning, average):
+    walk, bent = leaning
+    so_far = mf.Fit(Correction((), ()), bent, bent, "converged", (), mf.Problem(average, bent, {}, ()))
+    arms = [average.skeleton.joint(f"{s}_upper_arm") for s in ("left", "right")]
+
+    def turn(shoulders: bool) -> float:
+        fit = mf.adapt.balance(walk, average, so_far, reference=average, shoulders=shoulders)
+        told = fit.details["balance"]
+        assert told["zmp_distance_after_m"] <= told["zmp_distance_source_m"] + 0.001
+        before, after = (host_kinematics(m)[1][:, arms] for m in (bent, fit.motion))
+        return float(2 * np.arccos(np.clip(np.abs((before * after).sum(-1)), 0.0, 1.0)).max())
+
+    # the ankles do most of it; what the spine does must not reach the arms
+    assert turn(True) < 0.1 * turn(False)
 
 
 def test_standing_moves_the_body_and_not_the_feet():

@@ -87,13 +87,13 @@ def write(path: pathlib.Path, rows: list[list[str]]) -> None:
 
 
 def draw(axes, rows: list[list[str]]) -> None:
-    """The distance of each row as a line from the original's to that after, the thesis's own in black."""
+    """The distance of each row as a line from the original's to that after: red where it is over a millimetre more."""
     done = [r for r in rows if "-" not in r[8:10]]
     for k, r in enumerate(done):
         start, end = (float(cell.split()[0]) for cell in r[8:10])
         colour = "k" if r[1] == "thesis" else "tab:blue" if end <= start + 0.1 else "tab:red"
-        axes.annotate("", (end, k), (start, k), arrowprops={"arrowstyle": "->", "color": colour, "lw": 1.2})
-        axes.plot(start, k, "o", color=colour, ms=4, mfc="w")
+        axes.plot([start, end], [k, k], color=colour, lw=1.2)
+        axes.plot(start, k, "o", color=colour, ms=5, mfc="w")
         axes.plot(end, k, "o", color=colour, ms=4)
     axes.set_yticks(range(len(done)), [f"{r[0]}, {r[1]}" for r in done], fontsize=6)
     axes.invert_yaxis()

@@ -56,14 +56,16 @@ class _Stance(NamedTuple):
 
 def balance(
     clip: Motion, character: Character, so_far: Fit, *, reference: Character | None = None, scale: float = 1.0,
-    gaze: bool = True,
+    gaze: bool = True, shoulders: bool = False,
 ) -> Fit:  # fmt: skip
     """Bring the zero-moment point no farther from the support than the clip has it on `reference`, frame by frame.
 
     Masses come from both bodies' shapes. The character leans over the ankles and bends the spine, (4.12), on top of
     `so_far`; the feet stay where they are in every frame, planted or not: the legs follow by the analytic leg.
     Without a reference the thresholds are those of the clip before any correction on the character itself. `scale`
-    multiplies them: below 0.9 it looks like a cartoon. `gaze` keeps the head's orientation.
+    multiplies them: below 0.9 it looks like a cartoon. `gaze` keeps the head's orientation;
+    `shoulders` that of the arms, which a bent spine would take along: "we recommend being careful with this as it may
+    introduce new penetrations", thesis 5.5.2; then the block leans less.
 
     A clip that is as balanced in the mean comes back as it was. `details["balance"]` holds the mean distance [m] of
     the source, and before and after; the root's way lies in the fit's `base`.
@@ -93,7 +95,7 @@ def balance(
     if _mean(before) <= wanted + MEAN_ENOUGH:
         return done(so_far, before)
 
-    controls = lean_controls(character, motion, at.whole, gaze)
+    controls = lean_controls(character, motion, at.whole, gaze, shoulders)
     feet = tuple(character.skeleton.joint(f"{s}_foot") for s in SIDES)
     share = _share(planted, float(motion.dt))
     term = ZmpMargin(stance.masses, stance.soles, _padded(planted[at.frames], at, False), np.zeros(len(at.rows)),
