@@ -23,14 +23,19 @@ def _alone(clip, character):
     return mf.Fit(Correction((), ()), base, base, "converged", (), mf.Problem(character, base, {}, ()))
 
 
-@pytest.fixture(scope="module")
-def leaning(average):
-    """The walk, the trunk bent sideways by 14 degrees at its lowest joint."""
+def _bent(average, axis):
+    """The walk, the trunk bent by 14 degrees at its lowest joint, about an axis of its parent's."""
     walk = samples.walk(cycles=1)
     joint, basis = average.skeleton.chain("spine")[0], per_frame(walk.frame_count)
-    axis = np.array([0.0, 0.0, 1.0])
-    bent = Correction((Control("bend", (Drive(joint, axis, 1.0),), basis),), (np.full(basis.count, np.deg2rad(14.0)),))
+    control = Control("bend", (Drive(joint, np.array(axis) / np.linalg.norm(axis), 1.0),), basis)
+    bent = Correction((control,), (np.full(basis.count, np.deg2rad(14.0)),))
     return walk, bent.apply(mf.onto(walk, average.skeleton))
+
+
+@pytest.fixture(scope="module")
+def leaning(average):
+    """Bent sideways."""
+    return _bent(average, [0.0, 0.0, 1.0])
 
 
 @pytest.mark.slow
@@ -64,6 +69,18 @@ def test_a_scale_that_makes_cartoons_is_said(average):
         mf.adapt.balance(walk[:1], average, _alone(walk[:1], average), reference=average, scale=0.5)
     with pytest.raises(mf.InputError, match="0 to 2"):
         mf.adapt.balance(walk, average, _alone(walk, average), scale=-1.0)
+
+
+@pytest.mark.slow
+def test_no_more_balance_than_was_asked_for(average):
+    """Bent forward and sideways one foot's frames are nearer to their support and the other's farther: brought back to
+    their thresholds, the mean would fall to 0.87 of the source's."""
+    walk, bent = _bent(average, [1.0, 0.0, 1.0])
+    so_far = mf.Fit(Correction((), ()), bent, bent, "converged", (), mf.Problem(average, bent, {}, ()))
+    told = mf.adapt.balance(walk, average, so_far, reference=average).details["balance"]
+    assert told["zmp_distance_before_m"] > told["zmp_distance_source_m"] + 0.001
+    assert 0.97 * told["zmp_distance_source_m"] <= told["zmp_distance_after_m"]
+    assert told["zmp_distance_after_m"] <= told["zmp_distance_source_m"] + 0.0005
 
 
 @pytest.mark.parametrize(("gaze", "shoulders"), [(True, True), (True, False), (False, True)])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -67,7 +68,8 @@ def balance(
     `shoulders` that of the arms, which a bent spine would take along: "we recommend being careful with this as it may
     introduce new penetrations", thesis 5.5.2; then the block leans less.
 
-    A clip that is as balanced in the mean comes back as it was. `details["balance"]` holds the mean distance [m] of
+    A clip that is as balanced in the mean comes back as it was, and where the mean would fall below 0.9 times what was
+    asked for, only the part of the lean is taken that reaches it. `details["balance"]` holds the mean distance [m] of
     the source, and before and after; the root's way lies in the fit's `base`.
     """
     if not 0.0 <= scale <= 2.0:
@@ -129,12 +131,23 @@ def balance(
         if _mean(after) > wanted + MEAN_ENOUGH:
             left = np.where(after.supported, np.asarray(after.outside) - scale * threshold, 0.0)
             limit = limit - np.maximum(left, 0.0)
+
+    def stood(part: float) -> tuple[Fit, ZmpDistance]:
+        some = _stood(so_far, controls, at, points, feet, share, part)
+        return some, _distance(character, some.motion, stance, planted, at)
+
     for part in (0.5, 0.25, 0.0) if sunk else ():
         # rather less balanced than a part in another
-        result = _stood(so_far, controls, at, points, feet, share, part)
-        after, sunk = _distance(character, result.motion, stance, planted, at), sinks(result.motion)
-        if not sunk:
+        result, after = stood(part)
+        if not sinks(result.motion):
             break
+    if not sunk and _mean(after) < CARTOON * wanted:
+        # the thresholds hold what was farther and let be what was nearer, so that the mean ends under the source's:
+        # what is more than was asked for is given back
+        part = _crossing(lambda part: _mean(stood(part)[1]) - wanted)
+        some, nearer = stood(part)
+        if not sinks(some.motion):
+            result, after = some, nearer
     reached = _mean(after) <= wanted + MOST_LEFT
     return done(dataclasses.replace(result, history=(*so_far.history, *history),
                                     status=so_far.status if reached else "violations_left"), after)  # fmt: skip
@@ -168,6 +181,15 @@ def _mean(distance: ZmpDistance, outside: np.ndarray | None = None) -> float:
     outside = np.asarray(distance.outside) if outside is None else outside
     supported = np.asarray(distance.supported)
     return float(outside[supported].mean()) if supported.any() else 0.0
+
+
+def _crossing(function: Callable[[float], float], steps: int = 6) -> float:
+    """Where between 0 and 1 a function that is positive at 0 has fallen to zero: by halves, from above."""
+    low, high = 0.0, 1.0
+    for _ in range(steps):
+        middle = (low + high) / 2
+        low, high = (middle, high) if function(middle) > 0.0 else (low, middle)
+    return high
 
 
 def _share(planted: Bool[np.ndarray, "frames 2"], dt: float) -> Float[np.ndarray, "frames 2"]:
