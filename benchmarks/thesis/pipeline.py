@@ -4,9 +4,9 @@ python -m benchmarks.thesis.pipeline [--data FOLDER] [--bodies NAME ...] [--clip
 
 `motionfit.adapt` with its own blocks, for a clip made for avg_male. Per clip and body: the share of the frames with
 more than 1 cm of excess on the skin, before and after, the worst excess left [cm], the jerk's ratio to that of the clip,
-how far the carrying feet slide [cm], the mean distance of the zero-moment point from its support [cm] (SD), of the
-original on its own body and after, the mean change of the joints [degrees], and the time [s]. The thesis's figures are
-those of table 5.6. Each row is written as soon as it is there; `--resume` goes on after the rows of a run that was cut.
+how far the carrying feet slide [cm], before and after, the mean distance of the zero-moment point from its support [cm]
+(SD), of the original on its own body and after, the mean change of the joints [degrees], and the time [s]. The thesis's
+figures are those of table 5.6. Each row is written as soon as it is there; `--resume` goes on after the rows of a run that was cut.
 A clip on a body that fails keeps its row, with the error as its status.
 """
 
@@ -34,8 +34,8 @@ KINDS: dict[str, str] = {
 BODIES = ("thin_male", "avg_female", "heavy_male", "tall_male")
 THESIS = {"walk": "Walk", "jump": "Jump", "hop": "Skip"}
 SKIN_LOOKS = 40  # per clip
-COLUMNS = ["clip", "body", "status", "skin % before", "after", "worst [cm]", "jerk", "slide [cm]", "ZMP original [cm]",
-           "ZMP after [cm]", "change [deg]", "time [s]"]  # fmt: skip
+COLUMNS = ["clip", "body", "status", "skin %", "after", "worst [cm]", "jerk", "slide [cm]", "after", "ZMP original [cm]",
+           "after", "change [deg]", "time [s]"]  # fmt: skip
 
 
 def row(clip: Motion, character: mf.Character, reference: mf.Character) -> list[str]:
@@ -52,16 +52,16 @@ def row(clip: Motion, character: mf.Character, reference: mf.Character) -> list[
     own = skin_depths(reference, original, step=step).depth
     before, after = (skin_depths(character, m, step=step).depth - own for m in (base, fit.motion))
     stance = source_stance(character, base, reference, original)
-    standing = measure_standing(character, fit.motion, stance)
-    balance = [{} if stance.reference is None else balance_measures(stance.reference), standing["balance"] or {}]
-    slide = (standing["feet"] or {}).get("slide_path_m")
+    standing = [measure_standing(character, m, stance) for m in (base, fit.motion)]
+    balance = [{} if stance.reference is None else balance_measures(stance.reference), standing[1]["balance"] or {}]
+    slides = [(s["feet"] or {}).get("slide_path_m") for s in standing]
     shares = [100 * float((depth > TOLERANCE).any(1).mean()) for depth in (before, after)]
     deviation = np.rad2deg(joint_angle_deviation(fit.motion, base)[0])
     figures = [*shares, 100 * after.max(), derivative_ratio(fit.motion, base, 3), deviation]
     moving = [fit.motion.root, fit.motion.rotations, *(f for f in figures if f is not None)]
     status = fit.status if all(np.isfinite(np.asarray(m, float)).all() for m in moving) else "NaN"
     return [status, f"{shares[0]:.0f}", f"{shares[1]:.0f}", f"{100 * after.max():.1f}",
-            "-" if figures[3] is None else f"{figures[3]:.3f}", "-" if slide is None else f"{100 * slide:.2f}",
+            "-" if figures[3] is None else f"{figures[3]:.3f}", *("-" if s is None else f"{100 * s:.1f}" for s in slides),
             *(_distance(m) for m in balance), f"{deviation:.2f}", f"{seconds:.1f}"]  # fmt: skip
 
 
@@ -88,9 +88,9 @@ def write(path: pathlib.Path, rows: list[list[str]]) -> None:
 
 def draw(axes, rows: list[list[str]]) -> None:
     """The distance of each row as a line from the original's to that after: red where it is over a millimetre more."""
-    done = [r for r in rows if "-" not in r[8:10]]
+    done = [r for r in rows if "-" not in r[9:11]]
     for k, r in enumerate(done):
-        start, end = (float(cell.split()[0]) for cell in r[8:10])
+        start, end = (float(cell.split()[0]) for cell in r[9:11])
         colour = "k" if r[1] == "thesis" else "tab:blue" if end <= start + 0.1 else "tab:red"
         axes.plot([start, end], [k, k], color=colour, lw=1.2)
         axes.plot(start, k, "o", color=colour, ms=5, mfc="w")
@@ -101,11 +101,10 @@ def draw(axes, rows: list[list[str]]) -> None:
 
 
 def main() -> None:
-    parser = argument_parser(__doc__ or "")
+    parser = argument_parser(__doc__ or "", clips=False)
     parser.add_argument("--clips", nargs="*", choices=KINDS, default=list(KINDS), metavar="KIND", help=", ".join(KINDS))
     parser.add_argument("--seconds", type=float, help="of each clip, from its beginning")
     parser.add_argument("--resume", action="store_true", help="keep the rows that are there")
-    parser.set_defaults(fps=None)  # the clips' own
     options = parser.parse_args()
     data, path = options.data, options.out / "pipeline.csv"
     reference = mf.load_character(data / "characters/avg_male.glb" if data else "builtin:average")
@@ -116,7 +115,7 @@ def main() -> None:
         for kind in options.clips if data else ("walk",):
             if (kind, body) in done:
                 continue
-            clip = mf.load_motion(data / f"{KINDS[kind]}.bvh", fps=options.fps) if data else samples.walk(cycles=1)
+            clip = mf.load_motion(data / f"{KINDS[kind]}.bvh") if data else samples.walk(cycles=1)
             if options.seconds:
                 clip = clip[: max(1, round(options.seconds * clip.frame_rate))]
             rows.append([kind, body, *row(clip, character, reference)])
@@ -124,7 +123,7 @@ def main() -> None:
             write(path, rows)
     for kind, name in THESIS.items():
         original, _, balanced = printed.BALANCED[name]
-        rows.append([kind, "thesis", *["-"] * 6, original, balanced, "-", "-"])
+        rows.append([kind, "thesis", *["-"] * 7, original, balanced, "-", "-"])
     table("The whole adaptation", COLUMNS, rows, options.out, "pipeline")
     save_figure(options.out / "pipeline.png", "Balance of the whole adaptation", lambda axes: draw(axes, rows))
 
