@@ -63,6 +63,13 @@ def test_a_clip_on_its_own_body_comes_back(average):
     assert fit.motion is so_far.motion and fit.correction is so_far.correction
 
 
+def test_all_frames_are_measured_not_only_those_that_the_solver_sees(average):
+    walk = samples.walk(cycles=1, frame_rate=120.0)
+    told = mf.adapt.balance(walk, average, _alone(walk, average), reference=average).details["balance"]
+    down = mf.detect_footplants(walk, average).planted.any(1)
+    assert told["supported_frames"] > 0.9 * down.sum()
+
+
 def test_a_scale_that_makes_cartoons_is_said(average):
     walk = samples.walk(cycles=1)
     with pytest.warns(UserWarning, match="cartoon"):

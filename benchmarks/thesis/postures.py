@@ -29,7 +29,7 @@ PLUMP = {"arms": 1.25, "legs": 1.2, "trunk": 1.35}
 GROWN: tuple[dict[str, float], ...] = ({}, {"arms": 1.7}, {"trunk": 1.5}, {"legs": 1.4}, PLUMP)
 AGES = (1.0, 1.2, 1.4, 1.6)  # girths that are solved; in between the motion is interpolated
 RESULT, ORIGINAL = (0.13, 0.55, 0.25), (0.80, 0.13, 0.13)  # the thesis's green and red
-BETWEEN = 0.95  # [m] from one posture to the next
+BETWEEN = 1.0  # [m] from one posture to the next
 
 
 class Scene(NamedTuple):
@@ -100,7 +100,8 @@ def postures(
 
 def draw_row(axes, row: Sequence[Posture], color: tuple[float, float, float] | None = None, alpha: float = 1.0) -> None:
     """Postures side by side, seen half from the side; in one `color`, or red where parts are in each other."""
-    for k, (character, motion, frame, excess, label) in enumerate(row):
+    floor = np.inf
+    for k, (character, motion, frame, excess, _) in enumerate(row):
         way = np.asarray(motion.root, float)[-1] - np.asarray(motion.root, float)[0]
         heading = float(np.arctan2(way[0], way[2])) if np.hypot(way[0], way[2]) > 0.3 else 0.0
         vertices = posed_vertices(character, motion[np.array([frame])])[0]
@@ -109,7 +110,9 @@ def draw_row(axes, row: Sequence[Posture], color: tuple[float, float, float] | N
                   else excess_colors(character, excess, [p.name for p in PAIRS]))  # fmt: skip
         draw_body(axes, vertices, np.asarray(character.skin.faces), yaw=0.45 - heading, shift=BETWEEN * k, colors=colors,
                   alpha=alpha)  # fmt: skip
-        axes.text(BETWEEN * k, vertices[:, 1].min() - 0.12, label, ha="center", fontsize=9)
+        floor = min(floor, float(vertices[:, 1].min()))
+    for k, posture in enumerate(row):
+        axes.text(BETWEEN * k, floor - 0.12, posture.label, ha="center", fontsize=9)
     axes.set_aspect("equal")
     axes.autoscale_view()
     axes.axis("off")
@@ -125,7 +128,7 @@ def picture(path, title: str, rows: dict[str, list[Posture]], superimposed: bool
     every = figure.subplots(heights, 1, squeeze=False, sharex=True, sharey=True)[:, 0]
     if superimposed:
         for (name, row), color, alpha in zip(rows.items(), (RESULT, ORIGINAL), (1.0, 0.45), strict=True):
-            draw_row(every[0], row, color, alpha)
+            draw_row(every[0], row if alpha == 1.0 else [p._replace(label="") for p in row], color, alpha)
             every[0].plot([], [], "s", color=color, label=name)
         figure.legend(frameon=False, loc="outside lower center", ncols=2)
     else:

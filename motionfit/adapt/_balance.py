@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
 from motionfit._character import Character
 from motionfit._control import Control, Correction
 from motionfit._fit import Block, Fit, fit
-from motionfit._motion import Motion, continued, forward_kinematics, host_kinematics
+from motionfit._motion import Motion, bucket, continued, forward_kinematics, host_kinematics
 from motionfit._onto import onto
 from motionfit._problem import During, Problem
 from motionfit._skeleton import SIDES
@@ -84,9 +84,9 @@ def balance(
     at = sampling(motion)
     own_stance = _stance(body, source, plants.floor)
     stance = _stance(character, motion, detect_footplants(motion, character).floor)
-    own = _distance(body, source, own_stance, planted, at)
+    own = _distance(body, source, own_stance, planted)
     threshold = np.asarray(own.outside)
-    before = _distance(character, motion, stance, planted, at)
+    before = _distance(character, motion, stance, planted)
     wanted = _mean(own, scale * threshold)
 
     def done(result: Fit, after: ZmpDistance) -> Fit:
@@ -105,7 +105,8 @@ def balance(
     seen = continued(at.motion(motion), len(at.rows))
     home = host_kinematics(seen)[0][:, list(feet)]
     sinks = _sinking(clip, character, reference, motion, at)
-    limit, points = scale * threshold + ALLOWED_EXCESS, Correction.zero(tuple(at.control(c) for c in controls))
+    limit = (scale * threshold + ALLOWED_EXCESS)[at.frames]
+    points = Correction.zero(tuple(at.control(c) for c in controls))
     smooth = JERK_SHARE * max(_jerk(motion), LEAST_JERK) / LEVER
     effort, history = EFFORT, []
     real = np.arange(len(at.rows)) < len(at.frames)
@@ -119,7 +120,7 @@ def balance(
                      correction=points)  # fmt: skip
         points, history = solved.correction, [*history, *solved.history]
         result = _stood(so_far, controls, at, points, feet, share)
-        after = _distance(character, result.motion, stance, planted, at)
+        after = _distance(character, result.motion, stance, planted)
         jerk = derivative_ratio(result.motion, motion, 3) or 1.0
         sunk = sinks(result.motion)
         if _mean(after) <= wanted + MEAN_ENOUGH and jerk <= MOST_JERK and not sunk:
@@ -129,12 +130,12 @@ def balance(
         if sunk:
             effort *= 0.5
         if _mean(after) > wanted + MEAN_ENOUGH:
-            left = np.where(after.supported, np.asarray(after.outside) - scale * threshold, 0.0)
+            left = np.where(after.supported, np.asarray(after.outside) - scale * threshold, 0.0)[at.frames]
             limit = limit - np.maximum(left, 0.0)
 
     def stood(part: float) -> tuple[Fit, ZmpDistance]:
         some = _stood(so_far, controls, at, points, feet, share, part)
-        return some, _distance(character, some.motion, stance, planted, at)
+        return some, _distance(character, some.motion, stance, planted)
 
     for part in (0.5, 0.25, 0.0) if sunk else ():
         # rather less balanced than a part in another
@@ -169,11 +170,13 @@ def _kinematics(skeleton, motion):
     return forward_kinematics(skeleton, motion)
 
 
-def _distance(body: Character, motion: Motion, stance: _Stance, planted: np.ndarray, at: Sampling) -> ZmpDistance:
-    """Distances of the frames that are seen."""
-    seen, count = continued(at.motion(motion), len(at.rows)), len(at.frames)
+def _distance(body: Character, motion: Motion, stance: _Stance, planted: np.ndarray) -> ZmpDistance:
+    """Distances in all frames, those that the solver does not see too: near flight they differ by centimetres from one
+    frame to the next."""
+    count = motion.frame_count
+    seen, more = continued(motion, bucket(count)), bucket(count) - count
     found = zmp_distance(_kinematics(body.skeleton, seen), stance.masses, stance.soles,
-                         _padded(planted[at.frames], at, False), ground=stance.ground[at.rows])  # fmt: skip
+                         np.pad(planted, ((0, more), (0, 0))), ground=np.pad(stance.ground, (0, more), "edge"))  # fmt: skip
     return ZmpDistance(np.asarray(found.signed)[:count], np.asarray(found.supported)[:count])
 
 
