@@ -7,6 +7,7 @@ import motionfit as mf
 from motionfit import samples
 from motionfit._control import Control, Correction, Drive
 from motionfit._motion import Motion, continued, host_kinematics, joint_angles, padded
+from motionfit.adapt._controls import lean_controls
 from motionfit.adapt._record import recorded
 from motionfit.metrics import derivative_ratio
 from motionfit.splines import bspline_basis, per_frame
@@ -22,14 +23,19 @@ def _alone(clip, character):
     return mf.Fit(Correction((), ()), base, base, "converged", (), mf.Problem(character, base, {}, ()))
 
 
-@pytest.fixture(scope="module")
-def leaning(average):
-    """The walk, the trunk bent sideways by 14 degrees at its lowest joint."""
+def _bent(average, axis):
+    """The walk, the trunk bent by 14 degrees at its lowest joint, about an axis of its parent's."""
     walk = samples.walk(cycles=1)
     joint, basis = average.skeleton.chain("spine")[0], per_frame(walk.frame_count)
-    axis = np.array([0.0, 0.0, 1.0])
-    bent = Correction((Control("bend", (Drive(joint, axis, 1.0),), basis),), (np.full(basis.count, np.deg2rad(14.0)),))
+    control = Control("bend", (Drive(joint, np.array(axis) / np.linalg.norm(axis), 1.0),), basis)
+    bent = Correction((control,), (np.full(basis.count, np.deg2rad(14.0)),))
     return walk, bent.apply(mf.onto(walk, average.skeleton))
+
+
+@pytest.fixture(scope="module")
+def leaning(average):
+    """Bent sideways."""
+    return _bent(average, [0.0, 0.0, 1.0])
 
 
 @pytest.mark.slow
@@ -57,12 +63,62 @@ def test_a_clip_on_its_own_body_comes_back(average):
     assert fit.motion is so_far.motion and fit.correction is so_far.correction
 
 
+def test_all_frames_are_measured_not_only_those_that_the_solver_sees(average):
+    walk = samples.walk(cycles=1, frame_rate=120.0)
+    told = mf.adapt.balance(walk, average, _alone(walk, average), reference=average).details["balance"]
+    down = mf.detect_footplants(walk, average).planted.any(1)
+    assert told["supported_frames"] > 0.9 * down.sum()
+
+
 def test_a_scale_that_makes_cartoons_is_said(average):
     walk = samples.walk(cycles=1)
     with pytest.warns(UserWarning, match="cartoon"):
         mf.adapt.balance(walk[:1], average, _alone(walk[:1], average), reference=average, scale=0.5)
     with pytest.raises(mf.InputError, match="0 to 2"):
         mf.adapt.balance(walk, average, _alone(walk, average), scale=-1.0)
+
+
+@pytest.mark.slow
+def test_no_more_balance_than_was_asked_for(average):
+    """Bent forward and sideways one foot's frames are nearer to their support and the other's farther: brought back to
+    their thresholds, the mean would fall to 0.87 of the source's."""
+    walk, bent = _bent(average, [1.0, 0.0, 1.0])
+    so_far = mf.Fit(Correction((), ()), bent, bent, "converged", (), mf.Problem(average, bent, {}, ()))
+    told = mf.adapt.balance(walk, average, so_far, reference=average).details["balance"]
+    assert told["zmp_distance_before_m"] > told["zmp_distance_source_m"] + 0.001
+    assert 0.97 * told["zmp_distance_source_m"] <= told["zmp_distance_after_m"]
+    assert told["zmp_distance_after_m"] <= told["zmp_distance_source_m"] + 0.0005
+
+
+@pytest.mark.parametrize(("gaze", "shoulders"), [(True, True), (True, False), (False, True)])
+def test_a_bent_spine_takes_along_what_is_not_kept(average, gaze, shoulders):
+    """Thesis 5.5.2: the opposite of the spine's turn on head and shoulders keeps their orientation in the world."""
+    walk = mf.onto(samples.walk(cycles=1), average.skeleton)
+    controls = lean_controls(average, walk, bspline_basis(walk.frame_count, float(walk.dt), 0.1), gaze, shoulders)
+    bent = Correction(controls, tuple(np.full(np.shape(p), 0.2 if c.name == "spine_sideways" else 0.0)
+                                      for c, p in zip(controls, Correction.zero(controls).points, strict=True)))  # fmt: skip
+    before, after = (host_kinematics(m)[1] for m in (walk, bent.apply(walk)))
+    joints = [average.skeleton.joint(r) for r in ("chest", "head", "left_upper_arm", "right_forearm")]
+    turned = 2 * np.arccos(np.clip(np.abs((before * after).sum(-1)), 0.0, 1.0))[:, joints]
+    kept = [0.2, 0.2 * (not gaze), 0.2 * (not shoulders), 0.2 * (not shoulders)]
+    np.testing.assert_allclose(turned, np.tile(kept, (len(turned), 1)), atol=0.002)
+
+
+@pytest.mark.slow
+def test_shoulders_stay_while_the_body_leans(leaning, average):
+    walk, bent = leaning
+    so_far = mf.Fit(Correction((), ()), bent, bent, "converged", (), mf.Problem(average, bent, {}, ()))
+    arms = [average.skeleton.joint(f"{s}_upper_arm") for s in ("left", "right")]
+
+    def turn(shoulders: bool) -> float:
+        fit = mf.adapt.balance(walk, average, so_far, reference=average, shoulders=shoulders)
+        told = fit.details["balance"]
+        assert told["zmp_distance_after_m"] <= told["zmp_distance_source_m"] + 0.001
+        before, after = (host_kinematics(m)[1][:, arms] for m in (bent, fit.motion))
+        return float(2 * np.arccos(np.clip(np.abs((before * after).sum(-1)), 0.0, 1.0)).max())
+
+    # the ankles do most of it; what the spine does must not reach the arms
+    assert turn(True) < 0.1 * turn(False)
 
 
 def test_standing_moves_the_body_and_not_the_feet():

@@ -8,15 +8,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import motionfit as mf
+from benchmarks.thesis import valley
 from motionfit import samples
 from motionfit._character import PARTS
-from motionfit._control import Control, Correction, Drive
+from motionfit._control import Correction
 from motionfit._fit import block_adjoint, block_solver, block_work, solve_block
 from motionfit._motion import Motion, host_kinematics, rest_motion
 from motionfit.adapt import Group, Sphere, Turn, multi_start
 from motionfit.adapt._collisions import GROUPS, known_depths
 from motionfit.splines import bspline_basis
-from motionfit.terms import Direction, Effort, SkinContact
+from motionfit.terms import Direction, SkinContact
 from tests.helpers import central_difference, random_motion
 
 RELATIVE = 1e-5  # analytic against central differences in double precision
@@ -142,22 +143,11 @@ def test_contact_asks_only_for_what_was_lost(average):
 def test_multi_start_escapes_the_trap_of_figure_4_9():
     """A straight arm that should point away from the way it bends: the gradient at zero pushes the elbow against its
     bound, where the solver stays; twisting the shoulder first leads to the minimum."""
-    names = ["hips", "left_upper_arm", "left_forearm", "left_hand"]
-    skeleton = mf.Skeleton(names, [-1, 0, 1, 2], np.array([[0, 0, 0], [0, 0, 0], [0, -0.3, 0], [0, -0.25, 0.0]], float))
-    frames = 8
-    motion = Motion(skeleton, np.zeros((frames, 3)), np.tile([1.0, 0, 0, 0], (frames, 4, 1)), 1 / 60)
-    basis = bspline_basis(frames, 1 / 60, 0.1)
-    controls = (Control("twist", (Drive(1, np.array([0.0, -1.0, 0.0]), 1.0),), basis),
-                Control("bend", (Drive(2, np.array([-1.0, 0.0, 0.0]), 1.0),), basis, 0.0, np.pi / 2))  # fmt: skip
-    away = Rotation.from_rotvec([0.0, -np.deg2rad(120.0), 0.0]) * Rotation.from_rotvec([-1.0, 0.0, 0.0])
-    target = np.tile(away.apply([0.0, -1.0, 0.0]), (frames, 1, 1))
-    terms = {"direction": Direction((2,), (3,), target), "effort": Effort(2.0)}
-    body = eqx.tree_at(lambda c: c.skeleton, mf.load_character("builtin:average"), skeleton)
-    problem = mf.Problem(body, motion, terms, controls)
-    block = mf.Block("forearm", ("twist", "bend"))
+    problem = valley.trap()
+    block, controls = valley.BLOCK, problem.controls
 
     def cost(correction):
-        return sum(problem.costs(correction).values())
+        return valley.cost(problem, correction)
 
     # figure 4.9's surface: from zero, every step of the bend leads uphill
     zero = Correction.zero(controls)

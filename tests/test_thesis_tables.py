@@ -7,9 +7,11 @@ import pytest
 
 import motionfit as mf
 from benchmarks.thesis import _printed as printed
-from benchmarks.thesis import scales, support
+from benchmarks.thesis import pipeline, postures, scales, support, valley
 from benchmarks.thesis._setting import CLIPS, MODELS, kinematics, planted_feet, truth
 from motionfit import samples
+from motionfit._control import Correction
+from motionfit._motion import joint_angles
 from motionfit.balance import zero_moment_point, zmp_distance
 from motionfit.shape.mass import LIMBS
 
@@ -70,3 +72,42 @@ def test_scripts_run_without_data(script, tmp_path, monkeypatch, capsys):
     printed_out = capsys.readouterr().out
     assert "thesis" in printed_out and "nan" not in printed_out
     assert list(tmp_path.glob("*.csv")) and list(tmp_path.glob("*.png"))
+
+
+def test_the_valley_is_drawn(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["script", "--out", str(tmp_path)])
+    valley.main()
+    assert "ten of a grid" in capsys.readouterr().out
+    assert (tmp_path / "figure_4_9.png").stat().st_size > 10_000 and (tmp_path / "figure_4_9.csv").exists()
+
+
+def test_a_cut_pipeline_goes_on_and_tells_of_failures(tmp_path, monkeypatch, capsys, average):
+    done = []
+
+    def row(clip, character, reference):
+        done.append(character.name)
+        return failed if len(done) == 1 else ["converged", *["0"] * 6, "3.37 (6.29)", "3.30 (5.61)", "1", "2"]
+
+    failed = pipeline.row(samples.walk(cycles=1), None, average)  # pyright: ignore[reportArgumentType]
+    assert "Error: " in failed[0] and len(failed) == len(pipeline.COLUMNS) - 2
+    monkeypatch.setattr(pipeline, "row", row)
+    for bodies in (["heavy"], ["heavy", "slim"]):
+        monkeypatch.setattr(sys, "argv", ["script", "--out", str(tmp_path), "--resume", "--bodies", *bodies])
+        pipeline.main()
+    assert done == ["builtin:heavy", "builtin:slim"]
+    assert [r[:3] for r in pipeline.read(tmp_path / "pipeline.csv")][1] == ["walk", "slim", "converged"]
+    assert "8.38 (7.78)" in capsys.readouterr().out and (tmp_path / "pipeline.png").exists()
+
+
+def test_a_growing_body_goes_from_one_fit_to_the_other(average, tmp_path):
+    base = mf.onto(samples.walk(cycles=1), average.skeleton)
+    other = base[::-1]
+    fits = [
+        mf.Fit(Correction((), ()), m, base, "converged", (), mf.Problem(average, base, {}, ())) for m in (base, other)
+    ]
+    for share, expected in ((0.0, base), (1.0, other)):
+        motion = postures.between(fits[0], fits[1], share, base)
+        np.testing.assert_allclose(joint_angles(motion, expected), 0.0, atol=1e-7)
+    row = [postures.Posture(average, base, 0, np.full(len(mf.shape.PAIRS), 0.01), "0 s")]
+    postures.picture(tmp_path / "rows.png", "title", {"adapted": row, "original": row})
+    assert (tmp_path / "rows.png").stat().st_size > 10_000

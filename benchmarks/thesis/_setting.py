@@ -37,13 +37,21 @@ MODELS: dict[str, Callable[[mf.Character], Masses]] = {
 
 
 def arguments(description: str, *, clips: bool = True) -> argparse.Namespace:
+    return argument_parser(description, clips=clips).parse_args()
+
+
+def argument_parser(description: str, *, clips: bool = True) -> argparse.ArgumentParser:
+    """The options that all scripts know, for those that add some of their own."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=pathlib.Path, help="folder with bvh/*.bvh and characters/*.glb")
     parser.add_argument("--bodies", nargs="*", help="stems in characters/, or built-in names without --data")
     if clips:
         parser.add_argument("--fps", type=float, default=60.0)
+        parser.add_argument(
+            "--clips", nargs="*", choices=CLIPS, default=list(CLIPS), metavar="KIND", help=", ".join(CLIPS)
+        )
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("benchmark_results"))
-    return parser.parse_args()
+    return parser
 
 
 def bodies(options: argparse.Namespace) -> dict[str, mf.Character]:
@@ -55,7 +63,9 @@ def bodies(options: argparse.Namespace) -> dict[str, mf.Character]:
 def clips(options: argparse.Namespace) -> dict[str, mf.Motion]:
     if options.data is None:
         return {"Normal walk": samples.walk(frame_rate=options.fps)}
-    return {k: mf.load_motion(options.data / f"{v}.bvh", fps=options.fps) for k, v in CLIPS.items()}
+    return {
+        k: mf.load_motion(options.data / f"{v}.bvh", fps=options.fps) for k, v in CLIPS.items() if k in options.clips
+    }
 
 
 # one program per clip length instead of one per operation
@@ -111,16 +121,18 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence], out: pat
     (out / f"{name}.csv").write_text(text + "\n", encoding="utf-8")
 
 
-def save_figure(path: pathlib.Path, title: str, draw: Callable) -> None:
-    """One plot, drawn by `draw(axes)`, without a display."""
+def save_figure(
+    path: pathlib.Path, title: str, draw: Callable, panels: tuple[int, int] = (1, 1), size: tuple[float, float] = (9, 5)
+) -> None:
+    """One plot, drawn by `draw(axes)`, without a display; or rows and columns of `panels`, by `draw(array of axes)`."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure, axes = plt.subplots(figsize=(9, 5), layout="constrained")
-    axes.set_title(title)
+    figure, axes = plt.subplots(*panels, figsize=size, layout="constrained")
+    figure.suptitle(title)
     draw(axes)
     figure.savefig(path, dpi=120)
     plt.close(figure)

@@ -1,6 +1,7 @@
-"""Table 5.6: mean distance of the zero-moment point from its support, for the original, corrected and balanced clips.
+"""Table 5.6 and figure 5.19: how far the zero-moment point is from its support, for the original, corrected and balanced
+clips.
 
-python -m benchmarks.thesis.balance [--data FOLDER] [--bodies NAME ...] [--out DIR]
+python -m benchmarks.thesis.balance [--data FOLDER] [--bodies NAME ...] [--clips KIND ...] [--out DIR]
 
 Original is the clip on the body that it was made for, corrected that with arms and legs adapted to the other body,
 balanced the same with the balance block. Measured at the clip's own frame rate, with the masses of the cut mesh. Beside
@@ -12,20 +13,29 @@ import numpy as np
 
 import motionfit as mf
 from benchmarks.thesis import _printed as printed
-from benchmarks.thesis._setting import arguments, bodies, clips, kinematics, table
+from benchmarks.thesis._setting import arguments, bodies, clips, kinematics, save_figure, table
 from motionfit._motion import host_kinematics
-from motionfit.balance import balance_measures, sole_boxes, zmp_distance
+from motionfit.balance import ZmpDistance, balance_measures, sole_boxes, zmp_distance
 from motionfit.metrics import derivative_ratio, skin_depths
 from motionfit.shape.mass import mesh_masses
 
 SKIN_LOOKS = 40  # per clip
+STAGES = {"original": "k", "corrected": "tab:red", "balanced": "tab:green"}
 
 
-def distance(character: mf.Character, motion: mf.Motion, planted: np.ndarray) -> dict:
+def distance(character: mf.Character, motion: mf.Motion, planted: np.ndarray) -> ZmpDistance:
     floor = mf.detect_footplants(motion, character).floor
-    found = zmp_distance(kinematics(character.skeleton, motion), mesh_masses(character), sole_boxes(character), planted,
-                         ground=floor.at(np.asarray(motion.root, float)))  # fmt: skip
-    return balance_measures(found)
+    return zmp_distance(kinematics(character.skeleton, motion), mesh_masses(character), sole_boxes(character), planted,
+                        ground=floor.at(np.asarray(motion.root, float)))  # fmt: skip
+
+
+def draw(axes, found: list[ZmpDistance], dt: float) -> None:
+    """Figure 5.19: the distances of one clip over time, with gaps where nothing carries."""
+    for one, (name, colour) in zip(found, STAGES.items(), strict=True):
+        outside = np.where(one.supported, 100 * np.asarray(one.outside), np.nan)
+        axes.plot(dt * np.arange(len(outside)), outside, color=colour, label=name)
+    axes.set(xlabel="time [s]", ylabel="distance from the support [cm]")
+    axes.legend()
 
 
 def main() -> None:
@@ -53,8 +63,11 @@ def main() -> None:
                     for f in (corrected, balanced)]  # fmt: skip
             cells = [
                 f"{100 * (m['zmp_distance_mean_m'] or 0):.2f} ({100 * (m['zmp_distance_sd_m'] or 0):.2f})"
-                for m in found
+                for m in map(balance_measures, found)
             ]
+            if name == "Normal walk":
+                save_figure(options.out / f"figure_5_19_{body}.png", f"Figure 5.19: the walk on {body}",
+                            lambda axes, found=found, dt=float(clip.dt): draw(axes, found, dt))  # fmt: skip
             jerk = derivative_ratio(balanced.motion, corrected.motion, 3)
             rows.append([name, body, *cells, f"{1e3 * moved:.3f}", f"{jerk:.3f}", *(f"{100 * o:.0f}" for o in over),
                          balanced.status])  # fmt: skip

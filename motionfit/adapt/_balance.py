@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
 from motionfit._character import Character
 from motionfit._control import Control, Correction
 from motionfit._fit import Block, Fit, fit
-from motionfit._motion import Motion, continued, forward_kinematics, host_kinematics
+from motionfit._motion import Motion, bucket, continued, forward_kinematics, host_kinematics
 from motionfit._onto import onto
 from motionfit._problem import During, Problem
 from motionfit._skeleton import SIDES
@@ -56,16 +57,19 @@ class _Stance(NamedTuple):
 
 def balance(
     clip: Motion, character: Character, so_far: Fit, *, reference: Character | None = None, scale: float = 1.0,
-    gaze: bool = True,
+    gaze: bool = True, shoulders: bool = False,
 ) -> Fit:  # fmt: skip
     """Bring the zero-moment point no farther from the support than the clip has it on `reference`, frame by frame.
 
     Masses come from both bodies' shapes. The character leans over the ankles and bends the spine, (4.12), on top of
     `so_far`; the feet stay where they are in every frame, planted or not: the legs follow by the analytic leg.
     Without a reference the thresholds are those of the clip before any correction on the character itself. `scale`
-    multiplies them: below 0.9 it looks like a cartoon. `gaze` keeps the head's orientation.
+    multiplies them: below 0.9 it looks like a cartoon. `gaze` keeps the head's orientation;
+    `shoulders` that of the arms, which a bent spine would take along: "we recommend being careful with this as it may
+    introduce new penetrations", thesis 5.5.2; then the block leans less.
 
-    A clip that is as balanced in the mean comes back as it was. `details["balance"]` holds the mean distance [m] of
+    A clip that is as balanced in the mean comes back as it was, and where the mean would fall below 0.9 times what was
+    asked for, only the part of the lean is taken that reaches it. `details["balance"]` holds the mean distance [m] of
     the source, and before and after; the root's way lies in the fit's `base`.
     """
     if not 0.0 <= scale <= 2.0:
@@ -80,9 +84,9 @@ def balance(
     at = sampling(motion)
     own_stance = _stance(body, source, plants.floor)
     stance = _stance(character, motion, detect_footplants(motion, character).floor)
-    own = _distance(body, source, own_stance, planted, at)
+    own = _distance(body, source, own_stance, planted)
     threshold = np.asarray(own.outside)
-    before = _distance(character, motion, stance, planted, at)
+    before = _distance(character, motion, stance, planted)
     wanted = _mean(own, scale * threshold)
 
     def done(result: Fit, after: ZmpDistance) -> Fit:
@@ -93,7 +97,7 @@ def balance(
     if _mean(before) <= wanted + MEAN_ENOUGH:
         return done(so_far, before)
 
-    controls = lean_controls(character, motion, at.whole, gaze)
+    controls = lean_controls(character, motion, at.whole, gaze, shoulders)
     feet = tuple(character.skeleton.joint(f"{s}_foot") for s in SIDES)
     share = _share(planted, float(motion.dt))
     term = ZmpMargin(stance.masses, stance.soles, _padded(planted[at.frames], at, False), np.zeros(len(at.rows)),
@@ -101,7 +105,8 @@ def balance(
     seen = continued(at.motion(motion), len(at.rows))
     home = host_kinematics(seen)[0][:, list(feet)]
     sinks = _sinking(clip, character, reference, motion, at)
-    limit, points = scale * threshold + ALLOWED_EXCESS, Correction.zero(tuple(at.control(c) for c in controls))
+    limit = (scale * threshold + ALLOWED_EXCESS)[at.frames]
+    points = Correction.zero(tuple(at.control(c) for c in controls))
     smooth = JERK_SHARE * max(_jerk(motion), LEAST_JERK) / LEVER
     effort, history = EFFORT, []
     real = np.arange(len(at.rows)) < len(at.frames)
@@ -115,7 +120,7 @@ def balance(
                      correction=points)  # fmt: skip
         points, history = solved.correction, [*history, *solved.history]
         result = _stood(so_far, controls, at, points, feet, share)
-        after = _distance(character, result.motion, stance, planted, at)
+        after = _distance(character, result.motion, stance, planted)
         jerk = derivative_ratio(result.motion, motion, 3) or 1.0
         sunk = sinks(result.motion)
         if _mean(after) <= wanted + MEAN_ENOUGH and jerk <= MOST_JERK and not sunk:
@@ -125,14 +130,25 @@ def balance(
         if sunk:
             effort *= 0.5
         if _mean(after) > wanted + MEAN_ENOUGH:
-            left = np.where(after.supported, np.asarray(after.outside) - scale * threshold, 0.0)
+            left = np.where(after.supported, np.asarray(after.outside) - scale * threshold, 0.0)[at.frames]
             limit = limit - np.maximum(left, 0.0)
+
+    def stood(part: float) -> tuple[Fit, ZmpDistance]:
+        some = _stood(so_far, controls, at, points, feet, share, part)
+        return some, _distance(character, some.motion, stance, planted)
+
     for part in (0.5, 0.25, 0.0) if sunk else ():
         # rather less balanced than a part in another
-        result = _stood(so_far, controls, at, points, feet, share, part)
-        after, sunk = _distance(character, result.motion, stance, planted, at), sinks(result.motion)
-        if not sunk:
+        result, after = stood(part)
+        if not sinks(result.motion):
             break
+    if not sunk and _mean(after) < CARTOON * wanted:
+        # the thresholds hold what was farther and let be what was nearer, so that the mean ends under the source's:
+        # what is more than was asked for is given back
+        part = _crossing(lambda part: _mean(stood(part)[1]) - wanted)
+        some, nearer = stood(part)
+        if not sinks(some.motion):
+            result, after = some, nearer
     reached = _mean(after) <= wanted + MOST_LEFT
     return done(dataclasses.replace(result, history=(*so_far.history, *history),
                                     status=so_far.status if reached else "violations_left"), after)  # fmt: skip
@@ -154,11 +170,13 @@ def _kinematics(skeleton, motion):
     return forward_kinematics(skeleton, motion)
 
 
-def _distance(body: Character, motion: Motion, stance: _Stance, planted: np.ndarray, at: Sampling) -> ZmpDistance:
-    """Distances of the frames that are seen."""
-    seen, count = continued(at.motion(motion), len(at.rows)), len(at.frames)
+def _distance(body: Character, motion: Motion, stance: _Stance, planted: np.ndarray) -> ZmpDistance:
+    """Distances in all frames, those that the solver does not see too: near flight they differ by centimetres from one
+    frame to the next."""
+    count = motion.frame_count
+    seen, more = continued(motion, bucket(count)), bucket(count) - count
     found = zmp_distance(_kinematics(body.skeleton, seen), stance.masses, stance.soles,
-                         _padded(planted[at.frames], at, False), ground=stance.ground[at.rows])  # fmt: skip
+                         np.pad(planted, ((0, more), (0, 0))), ground=np.pad(stance.ground, (0, more), "edge"))  # fmt: skip
     return ZmpDistance(np.asarray(found.signed)[:count], np.asarray(found.supported)[:count])
 
 
@@ -166,6 +184,15 @@ def _mean(distance: ZmpDistance, outside: np.ndarray | None = None) -> float:
     outside = np.asarray(distance.outside) if outside is None else outside
     supported = np.asarray(distance.supported)
     return float(outside[supported].mean()) if supported.any() else 0.0
+
+
+def _crossing(function: Callable[[float], float], steps: int = 6) -> float:
+    """Where between 0 and 1 a function that is positive at 0 has fallen to zero: by halves, from above."""
+    low, high = 0.0, 1.0
+    for _ in range(steps):
+        middle = (low + high) / 2
+        low, high = (middle, high) if function(middle) > 0.0 else (low, middle)
+    return high
 
 
 def _share(planted: Bool[np.ndarray, "frames 2"], dt: float) -> Float[np.ndarray, "frames 2"]:

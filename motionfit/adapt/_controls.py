@@ -64,12 +64,14 @@ def leg_controls(character: Character, motion: Motion, basis: Basis) -> tuple[Co
             Control("thighs_apart", apart, basis, -np.pi / 4, np.pi / 4))  # fmt: skip
 
 
-def lean_controls(character: Character, motion: Motion, basis: Basis, gaze: bool = True) -> tuple[Control, ...]:
+def lean_controls(
+    character: Character, motion: Motion, basis: Basis, gaze: bool = True, shoulders: bool = False
+) -> tuple[Control, ...]:
     """Ankle against thigh, and the spine, each sideways and forward: thesis 4.7.3, bounds (4.13).
 
     `lean_*` turns both thighs one way and both feet back, so that trunk and soles keep their orientation: seen from
     the feet, the hips move. `spine_*` bends the trunk, shared evenly by the spine's joints; with `gaze` the head
-    turns back. Positive is to the left, and forward. Axes are level and follow the hips' heading.
+    turns back, and with `shoulders` the upper arms, by the opposite of the spine's turn (thesis 5.5.2). Positive is to the left, and forward. Axes are level and follow the hips' heading.
     """
     skeleton = character.skeleton
     positions, world = host_kinematics(motion)
@@ -82,13 +84,14 @@ def lean_controls(character: Character, motion: Motion, basis: Basis, gaze: bool
         return tuple(Drive(j, _in_parent(skeleton, world, j, axis), gain) for j in joints)
 
     legs = [tuple(skeleton.joint(f"{s}_{r}") for s in SIDES) for r in ("thigh", "foot")]
-    head = (skeleton.joint("head"),) if gaze and skeleton.find("head") is not None else ()
+    roles = ("head",) * gaze + ("left_upper_arm", "right_upper_arm") * shoulders
+    kept = tuple(j for role in roles if (j := skeleton.find(role)) is not None)
     # about `forward` a positive turn takes what is up to the right, about `across` to the front
     for name, axis, up in (("sideways", forward, -1.0), ("forward", across, 1.0)):
         lean = drives(axis, legs[0], up) + drives(axis, legs[1], -up)
         controls.append(Control(f"lean_{name}", lean, basis, -np.pi / 8, np.pi / 8))
         if spine:
-            bend = drives(axis, spine, up / len(spine)) + drives(axis, head, -up)
+            bend = drives(axis, spine, up / len(spine)) + drives(axis, kept, -up)
             controls.append(Control(f"spine_{name}", bend, basis, -np.pi / 8, np.pi / 8))
     return tuple(controls)
 

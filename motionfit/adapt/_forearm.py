@@ -127,7 +127,7 @@ def multi_start(problem: Problem, block: Block, spacing: float = GRID, count: in
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     zero = tuple(jnp.asarray(p, float) for p in Correction.zero(problem.controls).points)
     work, solver = block_work(problem, block, zero), block_solver(problem, block)
-    costs = np.asarray(_costs_on_grid(work, jnp.asarray(grid, float)))
+    costs = np.asarray(costs_on_grid(work, jnp.asarray(grid, float)))
     chosen = grid[np.argsort(costs, kind="stable")[:count]]
     starts = tuple(jnp.asarray(np.tile(chosen[:, k, None], p.shape[0]) if k < 2 else np.zeros((len(chosen), p.shape[0])),
                                float) for k, p in enumerate(work.start))  # fmt: skip
@@ -141,7 +141,7 @@ def multi_start(problem: Problem, block: Block, spacing: float = GRID, count: in
 
 
 @eqx.filter_jit
-def _costs_on_grid(work, grid: Float[jax.Array, "starts 2"]) -> Float[jax.Array, " starts"]:
+def costs_on_grid(work, grid: Float[jax.Array, "starts 2"]) -> Float[jax.Array, " starts"]:
     def cost(x):
         start = tuple(jnp.full_like(p, x[k]) if k < 2 else p for k, p in enumerate(work.start))
         signals = work.objective.signals(work.points)

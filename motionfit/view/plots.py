@@ -41,8 +41,9 @@ def draw_body(
     base = SKIN[None] if colors is None else colors[faces[order]].mean(1)
     shaded = np.clip(light[:, None] * base, 0, 1)
     outline = corners[order][:, :, :2] + [shift, 0.0]
+    edges = "face" if alpha == 1.0 else "none"  # they close the gaps, and would be a net over what is transparent
     # an array is drawn without a copy, which matplotlib's stub does not know
-    faced = PolyCollection(outline, facecolors=shaded, edgecolors="face", linewidths=0.25, alpha=alpha)  # pyright: ignore[reportArgumentType]
+    faced = PolyCollection(outline, facecolors=shaded, edgecolors=edges, linewidths=0.25, alpha=alpha)  # pyright: ignore[reportArgumentType]
     axes.add_collection(faced)
 
 
@@ -104,6 +105,19 @@ def _moments(excess: np.ndarray) -> list[int]:
     return [int(t[worst[t].argmax()]) for t in thirds]
 
 
+def excess_colors(
+    character: Character, excess: Float[np.ndarray, " pairs"], pairs: list[str]
+) -> Float[np.ndarray, "vertices 3"]:
+    """Skin, the redder a part is the deeper it is in another: fully red from 3 cm of `excess` [m] on."""
+    colors = np.tile(SKIN, (len(character.part_of_vertex), 1))
+    for k, pair in enumerate(pairs):
+        share = np.clip(excess[k] / 0.03, 0.0, 1.0)
+        if excess[k] > 0.002:
+            mine = character.part_of_vertex == PARTS.index(pair.split("/")[0])
+            colors[mine] = np.minimum(colors[mine], (1 - share) * SKIN + share * RED)
+    return colors
+
+
 def _draw_moments(axes, character: Character, motion: Motion, excess, moments: list[int], pairs: list[str]) -> None:
     faces = np.asarray(character.skin.faces)
     posed = posed_vertices(character, motion[np.array(moments)])
@@ -112,13 +126,7 @@ def _draw_moments(axes, character: Character, motion: Motion, excess, moments: l
     width = 0.62 * float(np.ptp(np.asarray(character.skin.vertices_bind)[:, 1]))
     for i, frame in enumerate(moments):
         vertices = posed[i] - np.asarray(motion.root)[frame] * np.array([1.0, 0.0, 1.0])
-        colors = np.tile(SKIN, (len(vertices), 1))
-        for k, pair in enumerate(pairs):
-            share = np.clip(excess[frame, k] / 0.03, 0.0, 1.0)
-            if excess[frame, k] > 0.002:
-                part = PARTS.index(pair.split("/")[0])
-                mine = character.part_of_vertex == part
-                colors[mine] = np.minimum(colors[mine], (1 - share) * SKIN + share * RED)
+        colors = excess_colors(character, excess[frame], pairs)
         draw_body(axes, vertices, faces, yaw=0.45 - heading, shift=i * width, colors=colors)
         axes.text(i * width, -0.10, f"{frame * float(motion.dt):.2f} s", ha="center", fontsize=11)
     axes.set_aspect("equal")
