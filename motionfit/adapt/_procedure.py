@@ -9,6 +9,7 @@ from motionfit._fit import Fit
 from motionfit._motion import Motion
 from motionfit._onto import onto
 from motionfit._problem import Problem
+from motionfit._programs import make_room
 from motionfit._types import InputError
 from motionfit.adapt._balance import balance
 from motionfit.adapt._collisions import collisions
@@ -56,6 +57,7 @@ def adapt(
     unknown = [b for b in blocks if b not in BLOCKS]
     if unknown or not blocks:
         raise InputError(f"unknown block {', '.join(map(repr, unknown)) or 'list'}; blocks: {', '.join(BLOCKS)}")
+    make_room()
     if girth:
         reference, character = reference or character, grow(character, girth)
     base = onto(clip, character.skeleton)
