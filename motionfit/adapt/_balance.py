@@ -64,9 +64,9 @@ def balance(
     Masses come from both bodies' shapes. The character leans over the ankles and bends the spine, (4.12), on top of
     `so_far`; the feet stay where they are in every frame, planted or not: the legs follow by the analytic leg.
     Without a reference the thresholds are those of the clip before any correction on the character itself. `scale`
-    multiplies them: below 0.9 it looks like a cartoon. `gaze` keeps the head's orientation;
-    `shoulders` that of the arms, which a bent spine would take along: "we recommend being careful with this as it may
-    introduce new penetrations", thesis 5.5.2; then the block leans less.
+    multiplies them: below 0.9 it looks like a cartoon. `gaze` keeps the head's orientation. `shoulders` keeps that of the
+    arms, which a bent spine would take along; arms that no longer go with the trunk may come to lie in it (thesis 5.5.2
+    warns of that too), and then the block leans less.
 
     A clip that is as balanced in the mean comes back as it was, and where the mean would fall below 0.9 times what was
     asked for, only the part of the lean is taken that reaches it. `details["balance"]` holds the mean distance [m] of
