@@ -25,14 +25,12 @@ DATA = pathlib.Path(__file__).parents[2] / "shared" / "data"
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _programs_go_with_their_module():
-    """Unload a module's compiled programs after it.
+def _room_for_programs():
+    """A module of tests begins with room for its programs; the largest fills a quarter of what there is."""
+    from motionfit._programs import make_room
 
-    Every loaded program keeps several memory maps, a process may have 65,530 of them (vm.max_map_count), and a test
-    run compiles thousands of programs: past the limit the next load is a segmentation fault.
-    """
+    make_room(0.3)
     yield
-    jax.clear_caches()
 
 
 @pytest.fixture(scope="session")
