@@ -71,7 +71,8 @@ def lean_controls(
 
     `lean_*` turns both thighs one way and both feet back, so that trunk and soles keep their orientation: seen from
     the feet, the hips move. `spine_*` bends the trunk, shared evenly by the spine's joints; with `gaze` the head
-    turns back, and with `shoulders` the upper arms, by the opposite of the spine's turn (thesis 5.5.2). Positive is to the left, and forward. Axes are level and follow the hips' heading.
+    turns back, and with `shoulders` the upper arms, by the opposite of the spine's turn (thesis 5.5.2). Positive is to
+    the left, and forward. Axes are level and follow the hips' heading.
     """
     skeleton = character.skeleton
     positions, world = host_kinematics(motion)

@@ -30,8 +30,8 @@ class FootFit(eqx.Module):
     """A motion with its footskate removed.
 
     `motion` is the result and `base` the clip on the character as it came, `plants` the footplants that were held
-    (by every method), and `reachable` says per frame and foot whether a leg could reach where its foot should stand (all True for the
-    root method, which moves no leg).
+    (by every method), and `reachable` says per frame and foot whether a leg could reach where its foot should stand (all
+    True for the root method, which moves no leg).
     """
 
     motion: Motion
