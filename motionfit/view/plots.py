@@ -69,10 +69,12 @@ def report_picture(
     figure = Figure(figsize=(15, 10.5), layout="constrained")
     grid = figure.add_gridspec(2, 1, height_ratios=[1.35, 1.0])
     # one scale for both: arms that are led out would else make the same body look smaller
-    both = np.ravel(grid[0].subgridspec(1, 2).subplots(sharex=True, sharey=True))
-    for axes, name, motion, excess in zip(
-        both, ("before", "after"), (before, after), (excess_before, excess_after), strict=True
+    bodies = grid[0].subgridspec(1, 2)
+    axes = None
+    for column, (name, motion, excess) in enumerate(
+        (("before", before, excess_before), ("after", after, excess_after))
     ):
+        axes = figure.add_subplot(bodies[column], sharex=axes, sharey=axes)
         _draw_moments(axes, character, motion, excess, moments, pairs)
         worst = 100 * float(np.maximum(excess, 0).max(initial=0.0))
         axes.set_title(f"{name}: at worst {worst:.1f} cm deeper than allowed", fontsize=13)
