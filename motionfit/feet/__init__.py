@@ -21,9 +21,9 @@ from motionfit.feet._floor import Floor, fit_floor
 from motionfit.feet._follow import follow_feet
 from motionfit.feet._leg import hip_from_foot, hold_feet
 from motionfit.feet._plants import Footplants, Plant, load_labels, save_labels
-from motionfit.feet._remove import METHODS, FootFit, measure_feet, rows_of
+from motionfit.feet._remove import METHODS, FootFit, measure_feet
 from motionfit.feet._root import frame_heights, horizontal_path, root_steps, scaled_heights, vertical_scale
-from motionfit.feet._sole import Sole, find_sole, sole_paths
+from motionfit.feet._sole import Sole, find_sole, rows_of, sole_paths
 from motionfit.feet._transfer import catmull_rom, cubic_roots, place_at, transfer_instant
 
 __all__ = [

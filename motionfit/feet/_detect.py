@@ -16,7 +16,7 @@ from motionfit._motion import Motion
 from motionfit._skeleton import SIDES, Skeleton
 from motionfit.feet._floor import Floor, fit_floor
 from motionfit.feet._plants import Footplants, runs
-from motionfit.feet._sole import Sole, sole_paths
+from motionfit.feet._sole import Sole, rows_of, sole_paths
 
 ADULT_LEG = 0.85  # [m] the leg for which the bounds below are given; speeds and heights go with the leg
 STILL = 0.6  # [m/s] a sole that moves faster is not down
@@ -243,19 +243,12 @@ def choose_primary(
     dt: float,
 ) -> Int[np.ndarray, " frames"]:
     """The foot that carries: where both are down, the way of least slide between single supports (Viterbi)."""
-    speed = np.take_along_axis(evidence.speed, _rows(sole, vertex), axis=1)
+    speed = np.take_along_axis(evidence.speed, rows_of(sole, vertex), axis=1)
     # positive where the right foot slides less; single supports leave no choice
     lead = (speed[:, 0] - speed[:, 1]) * dt
     lead = np.where(planted.all(1), lead, np.where(planted[:, 1], 1e3, np.where(planted[:, 0], -1e3, 0.0)))
     right = two_state_path(lead, 2 * SLIP)
     return np.where(planted.any(1), right.astype(int), -1)
-
-
-def _rows(sole: Sole, vertex: Int[np.ndarray, "frames 2"]) -> Int[np.ndarray, "frames 2"]:
-    """Rows of the sole for vertices of the mesh; any row where there is none (-1)."""
-    row_of = np.zeros(int(sole.vertices.max()) + 1, int)
-    row_of[sole.vertices] = np.arange(len(sole.vertices))
-    return row_of[np.maximum(vertex, 0)]
 
 
 def detect(sole: Sole, motion: Motion, floor: Floor | None = None) -> tuple[Footplants, Evidence]:
@@ -277,7 +270,7 @@ def _without_fast_ends(
 ) -> Int[np.ndarray, "frames 2"]:
     """The vertices stood on, less the frames at both ends of a plant in whose step to the next one the vertex goes
     further than `still` [m]: the labels are decided on averages of a few frames, which see a foot leave too late."""
-    rows, vertex = _rows(sole, vertex), vertex.copy()
+    rows, vertex = rows_of(sole, vertex), vertex.copy()
     for foot in (0, 1):
         for start, end in runs(vertex[:, foot] >= 0):
             at = np.arange(start, end)

@@ -18,7 +18,7 @@ from motionfit.feet._floor import Floor
 from motionfit.feet._leg import with_leg_ik
 from motionfit.feet._plants import Footplants, Plant, load_labels
 from motionfit.feet._root import frame_heights, horizontal_path, scaled_heights
-from motionfit.feet._sole import Sole, find_sole, sole_paths
+from motionfit.feet._sole import Sole, find_sole, rows_of, sole_paths
 from motionfit.metrics import contact_preservation, feet_summary
 
 METHODS = ("root", "leg-ik", "adaptive")
@@ -79,13 +79,6 @@ def summarise(sole: Sole, paths: Float[np.ndarray, "frames soles 3"], plants: Fo
     """The `feet` entry of sole paths under footplants."""
     rows = rows_of(sole, plants.vertex)
     return feet_summary(paths, plants.floor.above(paths), sole.side, rows, plants.primary, plants.dt)
-
-
-def rows_of(sole: Sole, vertex: np.ndarray) -> np.ndarray:
-    """Mesh vertices to rows of the sole, -1 kept."""
-    table = np.full(int(sole.vertices.max()) + 2, -1)
-    table[sole.vertices] = np.arange(len(sole.vertices))
-    return table[vertex]
 
 
 def measure_feet(character: Character, motion: Motion, plants: Footplants | None = None) -> dict:

@@ -172,3 +172,10 @@ def sole_paths(sole: Sole, motion: Motion) -> Float[np.ndarray, "frames soles 3"
         moved = np.matmul(local, np.swapaxes(turn, 1, 2)) + place[:, None]
         paths[:, rows] += weight[:, None] * moved
     return paths
+
+
+def rows_of(sole: Sole, vertex: Int[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
+    """Mesh vertices to rows of the sole, -1 kept."""
+    table = np.full(int(sole.vertices.max()) + 2, -1)
+    table[sole.vertices] = np.arange(len(sole.vertices))
+    return table[vertex]
