@@ -20,6 +20,7 @@ from jaxtyping import Float, Int
 from motionfit._control import Control, Correction
 from motionfit._motion import Motion
 from motionfit._problem import Custom, Energy, Objective, Problem, Term, term_cost
+from motionfit._programs import program
 from motionfit._types import AnyArray, InputError
 from motionfit.banded import Banded
 
@@ -278,7 +279,7 @@ def solve_block(work: Work, solver, max_steps: int, adjoint: optx.AbstractAdjoin
                   solution.result == optx.RESULTS.successful)  # fmt: skip
 
 
-_solve = eqx.filter_jit(solve_block)
+_solve = program(solve_block)
 
 
 def block_solver(problem: Problem, block: Block):

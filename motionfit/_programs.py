@@ -1,11 +1,43 @@
-"""Room for compiled programs: how many of them one process can hold."""
+"""Compiled programs: how the large ones are compiled, and how many of them one process can hold."""
 
+import functools
 import gc
 import pathlib
+from collections.abc import Callable
 
+import equinox as eqx
 import jax
 
 FULL = 0.6  # of the memory maps that a process may have; a first adaptation takes five thousand of usually 65,530
+
+
+def program(fn: Callable) -> Callable:
+    """A function that ends on the host, jitted so that it compiles fast: never to be called under another jit.
+
+    XLA has emitted the fusions of a CPU through MLIR since jaxlib 0.9.1 (openxla/xla#41173 for what that costs), which
+    takes a block's solve twice as long to compile as its older emitters do, and makes it no faster to run.
+    """
+
+    @functools.cache
+    def jitted():
+        return eqx.filter_jit(fn, compiler_options=_options())
+
+    @functools.wraps(fn)
+    def call(*args, **kwargs):
+        return jitted()(*args, **kwargs)
+
+    return call
+
+
+@functools.cache
+def _options() -> dict[str, bool]:
+    """What XLA is told; nothing where it no longer knows the switch. Asked for late: it starts JAX's backend."""
+    options = {"xla_cpu_use_fusion_emitters": False}
+    try:
+        jax.jit(lambda x: x, compiler_options=options).lower(0.0).compile()
+    except jax.errors.JaxRuntimeError:
+        return {}
+    return options
 
 
 def make_room(full: float = FULL) -> bool:

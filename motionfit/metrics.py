@@ -7,16 +7,16 @@ Penetration is judged twice: on fitted volumes, and on the skinned mesh itself b
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from motionfit._character import Character
 from motionfit._motion import Motion, forward_kinematics, host_kinematics, joint_angles
+from motionfit._programs import program
 from motionfit._skinning import skin_points
 from motionfit._types import AnyArray
-from motionfit.shape.field import inside_depths, part_surface
 from motionfit.shape.pairs import PAIRS, Pair
+from motionfit.shape.surface import inside_depths, part_surface
 
 TOLERANCE = 0.01  # [m]: the "1 cm" of every frames_over_1cm
 
@@ -33,7 +33,7 @@ class SkinDepths(NamedTuple):
     frames: np.ndarray
 
 
-@jax.jit
+@program
 def _posed_vertices(skeleton, motion, vertices, joints, weights):
     return skin_points(forward_kinematics(skeleton, motion), vertices, joints, weights)
 
@@ -80,7 +80,10 @@ def skin_depths(
                 found[probe] = part
         return found
 
-    counted: dict[tuple[int, str], Bool[np.ndarray, "..."]] = {k: d == 0 for k, d in depths_at(bind, None).items()}
+    key = ("outside at bind", tuple(pairs))
+    if key not in character.memo:
+        character.memo[key] = {k: d == 0 for k, d in depths_at(bind, None).items()}
+    counted: dict[tuple[int, str], Bool[np.ndarray, "..."]] = character.memo[key]
     probed = max(sum(int(c.sum()) for c in counted.values()), 1)
     frames = np.arange(0, motion.frame_count, step)
     result, inside = np.zeros((len(frames), len(pairs))), 0

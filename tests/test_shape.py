@@ -1,6 +1,9 @@
 """Volumes against closed forms, distances against dense sampling, girth growth."""
 
+import dataclasses
+
 import equinox as eqx
+import igl
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,17 +17,17 @@ import motionfit as mf
 from motionfit import samples
 from motionfit._character import PARTS
 from motionfit._motion import bind_pose
+from motionfit.metrics import posed_vertices
 from motionfit.shape import grow, parse_girth
 from motionfit.shape.distance import capsule_depth, closest_on_lines, cylinder_depth, segment_distance
 from motionfit.shape.field import (
     depths,
     fit_field,
-    inside_depths,
     make_probes,
-    part_surface,
     standing,
     standing_vertices,
 )
+from motionfit.shape.surface import inside_depths, part_surface
 from motionfit.shape.volumes import fit_volumes
 from tests.helpers import central_difference
 
@@ -103,6 +106,24 @@ def test_a_field_tells_the_depth_below_the_skin(heavy):
         inside = exact > 0.004
         assert np.median(np.abs(told[inside] - exact[inside])) < 0.0015, part
         assert np.mean(told[exact == 0] < 0.004) > 0.95, part
+
+
+@given(st.integers(0, 2**31), st.sampled_from(["torso", "left_upper_arm", "right_forearm", "left_thigh", "right_calf"]))
+def test_inside_depths_are_those_of_all_triangles(heavy, seed, part):
+    """What spares libigl its trees changes nothing: in random poses, for points on, around and far from a part."""
+    rng, skeleton = np.random.default_rng(seed), heavy.skeleton
+    pose = standing(skeleton)
+    turns = Rotation.from_rotvec(rng.normal(size=(len(skeleton.names), 3)) * 0.3).as_quat(scalar_first=True)
+    pose = dataclasses.replace(pose, rotations=np.asarray(mf.rotation.multiply(pose.rotations[0], turns))[None])
+    posed = posed_vertices(heavy, pose)[0].astype(float)
+    surface = part_surface(heavy, part)
+    vertices = posed[surface.used]
+    points = vertices[rng.integers(0, len(vertices), 200)] + rng.normal(size=(200, 3)) * rng.choice([0.01, 0.05, 0.3])
+    points = np.concatenate([points, posed[rng.integers(0, len(posed), 200)]])
+    inside = np.asarray(igl.fast_winding_number(vertices, surface.triangles, points)) > 0.5
+    distance = np.sqrt(np.asarray(igl.point_mesh_squared_distance(points, vertices, surface.triangles)[0]))
+    wanted = np.where(inside, distance, 0.0)
+    assert np.abs(inside_depths(points, vertices, surface.triangles) - wanted).max() < 1e-6
 
 
 def test_a_field_moves_with_its_part(heavy, rng):

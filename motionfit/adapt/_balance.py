@@ -16,6 +16,7 @@ from motionfit._fit import Block, Fit, fit
 from motionfit._motion import Motion, bucket, continued, forward_kinematics, host_kinematics
 from motionfit._onto import onto
 from motionfit._problem import During, Problem
+from motionfit._programs import program
 from motionfit._skeleton import SIDES
 from motionfit._types import InputError
 from motionfit.adapt._clearance import build_clearance, volume_depths
@@ -165,7 +166,7 @@ def _stance(body: Character, motion: Motion, floor) -> _Stance:
     return _Stance(masses, soles, floor.at(np.asarray(motion.root, float)))
 
 
-@eqx.filter_jit
+@program
 def _kinematics(skeleton, motion):
     return forward_kinematics(skeleton, motion)
 

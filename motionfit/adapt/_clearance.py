@@ -12,18 +12,18 @@ from scipy.special import expit
 
 from motionfit._character import PARTS, Character
 from motionfit._motion import Kinematics, Motion, forward_kinematics
+from motionfit._programs import program
 from motionfit._skeleton import SIDES
 from motionfit._types import InputError
 from motionfit.shape.field import (
     Probes,
     fit_field,
-    inside_depths,
     make_probes,
-    part_surface,
     sample_vertices,
     standing_vertices,
 )
 from motionfit.shape.pairs import Pair
+from motionfit.shape.surface import inside_depths, part_surface
 from motionfit.shape.volumes import fit_volumes
 from motionfit.terms.penetration import CapsuleClearance, JointClearance, SkinClearance
 
@@ -167,7 +167,7 @@ def over_time(look, term: Term, motion: Motion) -> Float[np.ndarray, "frames ...
     return np.concatenate([np.asarray(_look(look, term, motion[some])) for some in order])[:frames]
 
 
-@eqx.filter_jit
+@program
 def _look(look, term: Term, motion: Motion):
     return look(term, forward_kinematics(motion.skeleton, motion))
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +14,7 @@ from motionfit._fit import Block, Fit, block_adjoint, block_solver, block_work, 
 from motionfit._motion import Motion, host_kinematics
 from motionfit._onto import onto
 from motionfit._problem import During, Problem
+from motionfit._programs import program
 from motionfit._skeleton import SIDES
 from motionfit.adapt._clearance import reduced, support
 from motionfit.adapt._collisions import Group, filled, known_depths, on_top
@@ -140,7 +140,7 @@ def multi_start(problem: Problem, block: Block, spacing: float = GRID, count: in
     return Correction(problem.controls, tuple(points))
 
 
-@eqx.filter_jit
+@program
 def costs_on_grid(work, grid: Float[jax.Array, "starts 2"]) -> Float[jax.Array, " starts"]:
     def cost(x):
         start = tuple(jnp.full_like(p, x[k]) if k < 2 else p for k, p in enumerate(work.start))
@@ -156,7 +156,7 @@ def costs_on_grid(work, grid: Float[jax.Array, "starts 2"]) -> Float[jax.Array, 
     return jax.lax.map(cost, grid, batch_size=16)
 
 
-@eqx.filter_jit
+@program
 def _refined(work, starts, solver, max_steps: int, adjoint):
     def solve(start):
         return solve_block(work._replace(start=start), solver, max_steps, adjoint)

@@ -33,6 +33,7 @@ from motionfit._fit import fit as refit
 from motionfit._motion import Motion, host_kinematics, rest_motion
 from motionfit._onto import onto
 from motionfit._problem import Energy, Problem
+from motionfit._programs import program
 from motionfit._skeleton import SIDES
 from motionfit._types import InputError
 from motionfit.adapt._clearance import Clearance, build_clearance, volume_depths
@@ -41,9 +42,10 @@ from motionfit.adapt._limbs import _stages as limb_stages
 from motionfit.adapt._limits import ENOUGH
 from motionfit.banded import Banded
 from motionfit.metrics import TOLERANCE
-from motionfit.shape.field import DepthField, Probes, part_surface, standing, standing_vertices
+from motionfit.shape.field import DepthField, Probes, standing, standing_vertices
 from motionfit.shape.growth import grow
 from motionfit.shape.pairs import pairs_of
+from motionfit.shape.surface import part_surface
 from motionfit.shape.volumes import allocate_vertices, fit_volumes
 from motionfit.terms.penetration import CapsuleClearance, SkinClearance
 
@@ -328,14 +330,14 @@ def _slope_in_signals(work: Work, signals: Float[Array, "frames free"]) -> Float
     return local + jax.grad(lambda s: jnp.sum(costs(s, False)))(signals)
 
 
-@eqx.filter_jit
+@program
 def _slope(work: Work, points: tuple[Array, ...]) -> tuple[Array, ...]:
     """dC/d points of a block's cost at some points of its controls."""
     signals, back = jax.vjp(lambda x: _signals(work, x), points)
     return back(_slope_in_signals(work, signals))[0]
 
 
-@eqx.filter_jit
+@program
 def _answer(work: Work, change: tuple[Array, ...], solver: Banded) -> tuple[Array, ...]:
     """How the optimum `work.start` answers a change of the slope there: -H^-1 change, H the Hessian of the cost."""
     signals, back = jax.vjp(lambda x: _signals(work, x), work.start)

@@ -8,7 +8,6 @@ winding numbers of the mesh have none.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,10 +19,11 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d, spline_filter
 from scipy.spatial.transform import Rotation
 
 from motionfit import rotation
-from motionfit._character import PARTS, Character
+from motionfit._character import Character
 from motionfit._motion import Kinematics, Motion, bind_pose, host_kinematics, rest_motion
 from motionfit._skeleton import SIDES, Skeleton
 from motionfit._types import AnyArray, InputError
+from motionfit.shape.surface import part_surface
 from motionfit.shape.volumes import bone_tips
 
 # nodes of the grid per axis: the same for every body, so that their corrections share one compiled program
@@ -276,47 +276,6 @@ def _lookup_jvp(primals, tangents):
 
 
 # --- making them ------------------------------------------------------------------------------------------------
-
-
-class Surface(NamedTuple):
-    """A body part's own piece of the skin."""
-
-    vertices: Int[np.ndarray, " part"]  # the part's vertices, in the whole mesh
-    used: Int[np.ndarray, " used"]  # the vertices that its triangles use
-    triangles: Int[np.ndarray, "triangles 3"]  # in indices into `used`
-
-
-def part_surface(character: Character, part: str) -> Surface:
-    """The vertices and triangles of a part; a triangle across a border belongs to the part of two of its corners."""
-    if part not in PARTS:
-        raise InputError(f"unknown part {part!r}; parts: {', '.join(PARTS)}")
-    index, part_of_vertex = PARTS.index(part), character.part_of_vertex
-    faces = np.asarray(character.skin.faces)
-    of_face = np.median(np.sort(part_of_vertex[faces], axis=1), axis=1).astype(int)
-    used, local = np.unique(faces[of_face == index], return_inverse=True)
-    return Surface(np.flatnonzero(part_of_vertex == index), used, local.reshape(-1, 3).astype(np.int64))
-
-
-def inside_depths(
-    points: Float[np.ndarray, "points 3"], vertices: Float[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "t 3"]
-) -> Float[np.ndarray, " points"]:
-    """Depth [m] of points inside a surface (generalised winding number > 1/2), 0 for those outside.
-
-    Jacobson et al. 2013, Barill et al. 2018, through libigl: surfaces may be open, as a cut-out part is.
-    """
-    import igl
-
-    depth = np.zeros(len(points))
-    if len(triangles) == 0:
-        return depth
-    near = np.flatnonzero(((points >= vertices.min(0)) & (points <= vertices.max(0))).all(-1))
-    if len(near) == 0:
-        return depth
-    near = near[np.asarray(igl.fast_winding_number(vertices, triangles, points[near])) > 0.5]
-    if len(near):
-        squared = np.asarray(igl.point_mesh_squared_distance(points[near], vertices, triangles)[0])
-        depth[near] = np.sqrt(np.maximum(squared, 0.0))
-    return depth
 
 
 def standing(skeleton: Skeleton, swing: float = 0.0, out: float = 0.035) -> Motion:

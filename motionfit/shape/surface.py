@@ -1,0 +1,125 @@
+"""A body part's own piece of the skin, and how deep points are inside it: exactly, frame by frame, on the host.
+
+Generalised winding numbers and distances come from libigl, which builds a tree of all triangles for each call. On a
+posed body that takes far longer than to ask it, so what can be told by simpler means is not asked.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial.distance import cdist
+
+from motionfit._character import PARTS, Character
+from motionfit._types import InputError
+
+SLICES = 16  # of a surface along its length, at most
+SIDES_OF_SLICE = 8
+APART = 0.05  # [m] between points that are measured one after the other, each with the triangles near it
+EVERY = 4  # vertices of a surface that bound a distance
+
+
+class Surface(NamedTuple):
+    """A body part's own piece of the skin."""
+
+    vertices: Int[np.ndarray, " part"]  # the part's vertices, in the whole mesh
+    used: Int[np.ndarray, " used"]  # the vertices that its triangles use
+    triangles: Int[np.ndarray, "triangles 3"]  # in indices into `used`
+
+
+def part_surface(character: Character, part: str) -> Surface:
+    """The vertices and triangles of a part; a triangle across a border belongs to the part of two of its corners."""
+    if part not in PARTS:
+        raise InputError(f"unknown part {part!r}; parts: {', '.join(PARTS)}")
+    key = ("surface", part)
+    if key not in character.memo:
+        index, part_of_vertex = PARTS.index(part), character.part_of_vertex
+        faces = np.asarray(character.skin.faces)
+        of_face = np.median(np.sort(part_of_vertex[faces], axis=1), axis=1).astype(int)
+        used, local = np.unique(faces[of_face == index], return_inverse=True)
+        surface = Surface(np.flatnonzero(part_of_vertex == index), used, local.reshape(-1, 3).astype(np.int64))
+        character.memo[key] = surface
+    return character.memo[key]
+
+
+def inside_depths(
+    points: Float[np.ndarray, "points 3"], vertices: Float[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "t 3"]
+) -> Float[np.ndarray, " points"]:
+    """Depth [m] of points inside a surface (generalised winding number > 1/2), 0 for those outside.
+
+    Jacobson et al. 2013, Barill et al. 2018, through libigl: surfaces may be open, as a cut-out part is.
+    """
+    import igl
+
+    depth = np.zeros(len(points))
+    if len(triangles) == 0 or len(points) == 0:
+        return depth
+    near = np.flatnonzero(may_be_inside(points, vertices, triangles))
+    if len(near) == 0:
+        return depth
+    near = near[np.asarray(igl.fast_winding_number(vertices, triangles, points[near])) > 0.5]
+    if len(near):
+        corners = vertices[triangles]
+        depth[near] = _distances(points[near], vertices, triangles, corners.min(1), corners.max(1))
+    return depth
+
+
+def may_be_inside(
+    points: Float[np.ndarray, "points 3"], vertices: Float[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "t 3"]
+) -> Bool[np.ndarray, " points"]:
+    """False for points that are outside a surface for certain: beyond the octagon around its slice at their height.
+
+    All around a point inside, at its own height along any axis, there is surface: that of its own slice or, where a
+    triangle reaches over a border, of the next one. An opening is closed by what lies around it.
+    """
+    box = vertices.min(0), vertices.max(0)
+    may = ((points >= box[0]) & (points <= box[1])).all(-1)
+    if not may.any():
+        return may
+    middle = vertices.mean(0)
+    about = vertices - middle
+    across, second, axis = np.linalg.eigh(about.T @ about)[1].T
+    heights = about @ axis
+    at_corners = heights[triangles]
+    longest = float((at_corners.max(1) - at_corners.min(1)).max())
+    low, length = float(heights.min()), float(np.ptp(heights))
+    slices = int(np.clip(length / max(longest, 1e-9), 1, SLICES))
+
+    def slice_of(heights):
+        return np.clip(((heights - low) * (slices / max(length, 1e-9))).astype(int), 0, slices - 1)
+
+    angles = np.arange(SIDES_OF_SLICE) * (2 * np.pi / SIDES_OF_SLICE)
+    directions = np.outer(across, np.cos(angles)) + np.outer(second, np.sin(angles))
+    own = slice_of(heights)
+    reach = np.full((slices + 2, SIDES_OF_SLICE), -np.inf)
+    order = np.argsort(own, kind="stable")
+    filled, starts = np.unique(own[order], return_index=True)
+    reach[filled + 1] = np.maximum.reduceat((about @ directions)[order], starts)
+    reach = np.maximum(np.maximum(reach[:-2], reach[1:-1]), reach[2:])
+    some = np.flatnonzero(may)
+    about = points[some] - middle
+    may[some] = (about @ directions <= reach[slice_of(about @ axis)]).all(-1)
+    return may
+
+
+def _distances(
+    points: Float[np.ndarray, "points 3"], vertices: Float[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "t 3"],
+    low: Float[np.ndarray, "t 3"], high: Float[np.ndarray, "t 3"],
+) -> Float[np.ndarray, " points"]:  # fmt: skip
+    """Distance [m] of points to triangles, whose boxes are given. Those that are apart, as under two arms, are
+    measured apart."""
+    import igl
+
+    axis = int(np.ptp(points, axis=0).argmax())
+    order = np.argsort(points[:, axis])
+    gaps = np.diff(points[order, axis])
+    if len(gaps) and gaps.max() > APART:
+        cut, distances = int(gaps.argmax()) + 1, np.zeros(len(points))
+        for some in (order[:cut], order[cut:]):
+            distances[some] = _distances(points[some], vertices, triangles, low, high)
+        return distances
+    # no point is further from the surface than from some of its vertices
+    bound = cdist(points, vertices[triangles[::EVERY, 0]]).min(1)[:, None]
+    near = ((high >= (points - bound).min(0)) & (low <= (points + bound).max(0))).all(-1)
+    squared = np.asarray(igl.point_mesh_squared_distance(points, vertices, triangles[near])[0])
+    return np.sqrt(np.maximum(squared, 0.0))
