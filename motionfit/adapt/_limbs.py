@@ -44,6 +44,9 @@ LEVER = 0.5  # [m] shoulder to hand
 LEAST_JERK = 30.0  # [m/s^3] for clips that stand still
 MOST_JERK = 1.04  # ratio to the source's
 CALM = 2.0  # knots over which a correction that is too jerky is smoothed before it is solved again
+WIDE = np.deg2rad(45.0)  # a turn that makes one look for a shorter way out
+# out, out and across: where an arm lies deep in a trunk or before it, each way out has a valley of its own
+STARTS = tuple(np.deg2rad(s) for s in ((30.0, 0.0, 0.0), (30.0, 30.0, 30.0), (30.0, -30.0, -30.0)))
 ROUNDS, PATIENCE = 9, 2  # rounds at most, and rounds without a better result
 CLOSER = (0, 1)  # rounds after which more frames are looked at
 
@@ -150,6 +153,8 @@ def limbs(
     for round_ in range(ROUNDS):
         problem = _problem(character, seen, stages, beyond, smooth, everything, (small, moved))
         result = fit(problem, _side_by_side(stages), sweeps, correction=correction, progress=told(round_))
+        if not round_ and start is None:
+            result = _from_elsewhere(problem, result, stages)
         correction, history = result.correction, [*history, *result.history]
         moved = result.motion[np.arange(small.frame_count)]
         used = allowed if not round_ else np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
@@ -197,6 +202,27 @@ def limbs(
     details = {"pairs": [p.name for p in pairs], "frames": seen.frames, "excess_before_m": excess,
                "excess_after_m": best.depths - own, "held_back_m": best.held_back}  # fmt: skip
     return Fit(final, final.apply(base), base, status, tuple(history), best.problem, details)  # pyright: ignore[reportArgumentType]
+
+
+def _from_elsewhere(problem: Problem, result: Fit, stages: list[Stage]) -> Fit:
+    """A first result with the arms that turned far solved again from other `STARTS`; the least cost of each counts."""
+    for block in (s.block for s in stages):
+        turned = max(float(np.abs(result.correction[name]).max()) for name in block.controls)
+        if turned < WIDE or len(block.controls) != len(STARTS[0]):
+            continue
+        cost = min(h.cost_after for h in result.history if h.name == block.name)
+        for angles in STARTS:
+            begun = dict(zip(block.controls, angles, strict=True))
+            points = tuple(
+                np.full(np.shape(p), begun[c.name]) if c.name in begun else p
+                for c, p in zip(result.correction.controls, result.correction.points, strict=True)
+            )
+            again = fit(problem, [block], correction=dataclasses.replace(result.correction, points=points))
+            history = (*result.history, *again.history)
+            if again.history[-1].cost_after < cost:
+                result, cost = again, again.history[-1].cost_after
+            result = dataclasses.replace(result, history=history)
+    return result
 
 
 def _unless_worse(
