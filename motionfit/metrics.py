@@ -4,7 +4,7 @@ Penetration is judged twice: on fitted volumes, and on the skinned mesh itself b
 (Jacobson et al. 2013; Barill et al. 2018, through libigl), so that volumes are never judged by volumes alone.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from motionfit._programs import program
 from motionfit._skinning import skin_points
 from motionfit._types import AnyArray
 from motionfit.shape.pairs import PAIRS, Pair
-from motionfit.shape.surface import inside_depths, part_surface
+from motionfit.shape.surface import Inside, find_inside, inside_depths, part_surface
 
 TOLERANCE = 0.01  # [m]: the "1 cm" of every frames_over_1cm
 
@@ -58,49 +58,62 @@ def skin_depths(
     which generalised winding numbers allow. Vertices that are inside at bind do not count: they are the joint
     itself. `step` looks at every step-th frame only.
     """
-    parts = sorted({p for pair in pairs for p in (pair.first, pair.second)})
-    surfaces = {part: part_surface(character, part) for part in parts}
-    bind = np.asarray(character.skin.vertices_bind, float)
-    # (probing part, surface part) in both directions of every pair
-    directions = [(k, a, b) for k, pair in enumerate(pairs) for a, b in (pair[:2], pair[1::-1])]
-    by_surface: dict[str, list[tuple[int, str]]] = {}
-    for k, a, b in directions:
-        by_surface.setdefault(b, []).append((k, a))
-
-    def depths_at(vertices: np.ndarray, counted: dict[tuple[int, str], np.ndarray] | None):
-        found = {}
-        for surface, probes in by_surface.items():
-            mesh = surfaces[surface]
-            groups = [surfaces[a].vertices for _, a in probes]
-            if counted is not None:
-                groups = [g[counted[k, a]] for g, (k, a) in zip(groups, probes, strict=True)]
-            points = vertices[np.concatenate(groups)] if groups else np.zeros((0, 3))
-            depth = inside_depths(points, vertices[mesh.used], mesh.triangles)
-            for probe, part in zip(probes, np.split(depth, np.cumsum([len(g) for g in groups])[:-1]), strict=True):
-                found[probe] = part
-        return found
-
-    key = ("outside at bind", tuple(pairs))
-    if key not in character.memo:
-        character.memo[key] = {k: d == 0 for k, d in depths_at(bind, None).items()}
-    counted: dict[tuple[int, str], Bool[np.ndarray, "..."]] = character.memo[key]
-    probed = max(sum(int(c.sum()) for c in counted.values()), 1)
     frames = np.arange(0, motion.frame_count, step)
     result, inside = np.zeros((len(frames), len(pairs))), 0
-    chunk = 16  # frames skinned at once: the whole clip would not fit for long clips
-    for start in range(0, len(frames), chunk):
-        some = frames[start : start + chunk]
-        # always whole chunks, so that the skinning compiles once
-        padded = np.append(some, np.full(chunk - len(some), some[-1]))
-        posed = posed_vertices(character, motion[padded]).astype(float)
-        for i in range(len(some)):
-            for (k, _), depth in depths_at(posed[i], counted).items():
-                if len(depth):
-                    result[start + i, k] = max(result[start + i, k], depth.max())
-                    inside += int((depth > 0).sum())
+    for i, _, found in insides(character, motion[frames], pairs):
+        for (k, *_), points in found.items():
+            if len(points.depth):
+                result[i, k] = max(result[i, k], points.depth.max())
+                inside += int((points.depth > 0.0).sum())  # not what lies on the border of both
         if progress is not None:
-            progress(min(start + chunk, len(frames)), len(frames))
+            progress(i + 1, len(frames))
+    probed = max(sum(len(v) for v in _probed(character, pairs).values()), 1)
     return SkinDepths(result, inside / (probed * max(len(frames), 1)), frames)
+
+
+Direction = tuple[int, str, str]  # which pair, the part whose vertices are tested, the part whose surface it is
+
+
+def insides(
+    character: Character, motion: Motion, pairs: Sequence[Pair] = PAIRS
+) -> Iterator[tuple[int, Float[np.ndarray, "vertices 3"], dict[Direction, Inside]]]:
+    """Frame after frame: its number, the posed vertices [m], and what `skin_depths` finds inside, by direction. Points
+    and triangles are numbered as in the whole skin and as in the part's own surface."""
+    probed = _probed(character, pairs)
+    by_surface: dict[str, list[Direction]] = {}
+    for direction in probed:
+        by_surface.setdefault(direction[2], []).append(direction)
+    surfaces = {part: part_surface(character, part) for part in by_surface}
+    chunk = 16  # frames skinned at once: the whole clip would not fit for long clips
+    for start in range(0, motion.frame_count, chunk):
+        # always whole chunks, so that the skinning compiles once
+        some = np.minimum(np.arange(start, start + chunk), motion.frame_count - 1)
+        posed = posed_vertices(character, motion[some]).astype(float)
+        for i in range(start, min(start + chunk, motion.frame_count)):
+            vertices, result = posed[i - start], {}
+            for part, directions in by_surface.items():
+                asked = np.concatenate([probed[d] for d in directions])
+                mesh = surfaces[part]
+                found = find_inside(vertices[asked], vertices[mesh.used], mesh.triangles)
+                ends = np.searchsorted(found.points, np.cumsum([len(probed[d]) for d in directions]))
+                for direction, low, high in zip(directions, [0, *ends[:-1]], ends, strict=True):
+                    own = Inside(*(x[low:high] for x in found))
+                    result[direction] = own._replace(points=asked[own.points])
+            yield i, vertices, result
+
+
+def _probed(character: Character, pairs: Sequence[Pair]) -> dict[Direction, Int[np.ndarray, " vertices"]]:
+    """The vertices that count, by direction: those inside at bind are the joint itself."""
+    key = ("probed", tuple(pairs))
+    if key not in character.memo:
+        bind = np.asarray(character.skin.vertices_bind, float)
+        probed = {}
+        for k, pair in enumerate(pairs):
+            for a, b in (pair[:2], pair[1::-1]):
+                mine, mesh = part_surface(character, a).vertices, part_surface(character, b)
+                probed[k, a, b] = mine[inside_depths(bind[mine], bind[mesh.used], mesh.triangles) == 0.0]
+        character.memo[key] = probed
+    return character.memo[key]
 
 
 def penetration_summary(excess: Float[np.ndarray, "frames pairs"], pairs: Sequence[Pair] = PAIRS) -> dict:

@@ -135,7 +135,7 @@ def limbs(
         beyond = np.where(quiet, 0.0, np.maximum(beyond, start.details["held_back_m"]))
     allowed = np.where(quiet, np.maximum(before, own), kept)
 
-    stages = _stages(character, blocks, pairs, objective, allowed, quiet)
+    stages = _stages(character, blocks, pairs, objective, allowed, quiet, looks is not None)
     smooth, history, moved = jerk_scale(base), [], small
     # by name: later blocks may have added controls of their own
     points = (Correction.zero(seen.controls).points if start is None
@@ -151,7 +151,7 @@ def limbs(
         return lambda name, done, _: progress(name, round_ * steps + done, ROUNDS * steps)  # pyright: ignore[reportOptionalCall]
 
     for round_ in range(ROUNDS):
-        problem = _problem(character, seen, stages, beyond, smooth, everything, (small, moved))
+        problem = _problem(character, seen, stages, beyond, smooth, everything, (small, moved), looks)
         result = fit(problem, _side_by_side(stages), sweeps, correction=correction, progress=told(round_))
         if not round_ and start is None:
             result = _from_elsewhere(problem, result, stages)
@@ -165,7 +165,7 @@ def limbs(
         else:
             if round_ in CLOSER:
                 looks.look_closer((after - own).max(axis=1))
-            on_skin = looks.depths(moved)
+            on_skin = looks.depths_and_touches(moved)
             # what the first looks missed
             woken = quiet & ~looks.quiet(on_skin, moved, 1.0)
             quiet = quiet & ~woken
@@ -299,7 +299,7 @@ def _final(controls: Sequence[Control], basis: Basis, correction: Correction) ->
 
 def _stages(
     character: Character, blocks: Sequence[str], pairs: tuple[Pair, ...], objective: str,
-    allowed: Float[np.ndarray, "frames pairs"], quiet: Bool[np.ndarray, " pairs"],
+    allowed: Float[np.ndarray, "frames pairs"], quiet: Bool[np.ndarray, " pairs"], touching: bool = False,
 ) -> list[Stage]:  # fmt: skip
     """The blocks of each recipe, in order: left arm, right arm, legs."""
     made = []
@@ -313,7 +313,8 @@ def _stages(
             clearance = build_clearance(character, mine, objective)
             columns = [pairs.index(p) for p in clearance.pairs]
             # a foot that stands shall not slide; arms may come and go
-            terms = (f"{name}_clearance", "effort", "smoothness", *(("steadiness",) if recipe == "legs" else ()))
+            terms = (f"{name}_clearance", *((f"{name}_touches",) if touching else ()), "effort", "smoothness",
+                     *(("steadiness",) if recipe == "legs" else ()))  # fmt: skip
             block = Block(name, controls, terms, max_steps=24, tolerance=1e-3)
             made.append(Stage(block, clearance, columns, allowed[:, columns], quiet[columns]))
     return made
@@ -326,7 +327,7 @@ def _own_sets(everything: Clearance, stage: Stage) -> Bool[np.ndarray, " sets"]:
 
 def _problem(
     character: Character, seen: Seen, stages: list[Stage], beyond: Float[np.ndarray, "frames pairs"], smooth: float,
-    everything: Clearance, motions: tuple[Motion, ...],
+    everything: Clearance, motions: tuple[Motion, ...], looks: SkinLooks | None,
 ) -> Problem:  # fmt: skip
     """The terms of all stages; probes are chosen by what they had to do with in `motions`."""
     real, length = seen.motion.frame_count, seen.padded.frame_count
@@ -346,6 +347,9 @@ def _problem(
             terms[name] = reduced(stage.clearance, scores[_own_sets(everything, stage)], limit, SOLVE_PROBES)  # pyright: ignore[reportArgumentType]
         else:
             terms[name] = stage.clearance.allowing(limit)
+        if looks is not None:
+            awake = np.array(stage.columns)[~stage.quiet]
+            terms[f"{stage.block.name}_touches"] = looks.touch_term(awake, ALLOWED_EXCESS, length)
     frames = np.arange(length)
     effort = Effort(np.array([SIGMA_EFFORT[c.name] for c in seen.controls]))
     terms["effort"] = During(effort, (frames < real).astype(float))

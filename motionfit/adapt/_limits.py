@@ -7,9 +7,11 @@ from motionfit._character import Character
 from motionfit._motion import Motion, host_kinematics, rest_motion
 from motionfit._onto import onto
 from motionfit.adapt._clearance import build_clearance, volume_depths
-from motionfit.metrics import TOLERANCE, skin_depths
+from motionfit.adapt._touches import Touches, touch_term, touches_of
+from motionfit.metrics import TOLERANCE, insides, skin_depths
 from motionfit.shape.field import standing
 from motionfit.shape.pairs import Pair
+from motionfit.terms.penetration import TouchClearance
 
 LEAST_LOOKS, LOOK_SHARE = 16, 1 / 15  # looks at the skin: at least, and per frame that the solver sees
 NEARLY = 0.9  # of TOLERANCE: what passes for no violation, since between two looks there may be a little more
@@ -72,6 +74,7 @@ class SkinLooks:
         if key not in reference.memo:
             reference.memo[key] = skin_depths(reference, at_ease(reference), pairs).depth.min(axis=0)
         self.at_ease = reference.memo[key] * _adjacent(pairs)
+        self.touches: dict[int, Touches] = {}
 
     def _own(
         self, motion: Motion, at: Int[np.ndarray, " some"], pairs: tuple[Pair, ...]
@@ -82,6 +85,22 @@ class SkinLooks:
     def depths(self, motion: Motion) -> Float[np.ndarray, "looks pairs"]:
         """Depth [m] per look and pair of a motion of the solver's frames."""
         return skin_depths(self.character, motion[self.at], self.pairs).depth
+
+    def depths_and_touches(self, motion: Motion) -> Float[np.ndarray, "looks pairs"]:
+        """The same, and what goes beyond the reference is kept: `touches`, by frame, the latest ones first."""
+        seen = motion[self.at]
+        rotations, result = host_kinematics(seen)[1], np.zeros(self.basis.shape)
+        for i, vertices, found in insides(self.character, seen, self.pairs):
+            for (pair, *_), inside in found.items():
+                result[i, pair] = max(result[i, pair], inside.depth.max(initial=0.0))
+            new, frame = touches_of(self.character, rotations[i], vertices, found, self.basis[i]), int(self.at[i])
+            self.touches[frame] = new.then(self.touches[frame]) if frame in self.touches else new
+        return result
+
+    def touch_term(self, columns: Int[np.ndarray, " some"], allowed: float, length: int) -> TouchClearance:
+        """The touches of some pairs as rows for the solver, up to `allowed` [m] more than the reference shows."""
+        limits = {int(frame): row + allowed for frame, row in zip(self.at, self.basis, strict=True)}
+        return touch_term(self.character, self.touches, columns, limits, len(self.frames), length)
 
     def look_closer(self, risk: Float[np.ndarray, " frames"]) -> None:
         """Look at more frames from now on: those of greatest `risk`, apart from each other and from former looks."""

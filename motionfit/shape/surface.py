@@ -42,25 +42,41 @@ def part_surface(character: Character, part: str) -> Surface:
     return character.memo[key]
 
 
-def inside_depths(
+class Inside(NamedTuple):
+    """The points that are inside a surface, and where it is nearest to them."""
+
+    points: Int[np.ndarray, " inside"]  # among those asked about
+    depth: Float[np.ndarray, " inside"]  # [m]
+    triangles: Int[np.ndarray, " inside"]
+    places: Float[np.ndarray, "inside 3"]  # [m]
+
+
+def find_inside(
     points: Float[np.ndarray, "points 3"], vertices: Float[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "t 3"]
-) -> Float[np.ndarray, " points"]:
-    """Depth [m] of points inside a surface (generalised winding number > 1/2), 0 for those outside.
+) -> Inside:
+    """The points inside a surface: those of generalised winding number > 1/2.
 
     Jacobson et al. 2013, Barill et al. 2018, through libigl: surfaces may be open, as a cut-out part is.
     """
     import igl
 
-    depth = np.zeros(len(points))
-    if len(triangles) == 0 or len(points) == 0:
-        return depth
-    near = np.flatnonzero(may_be_inside(points, vertices, triangles))
-    if len(near) == 0:
-        return depth
-    near = near[np.asarray(igl.fast_winding_number(vertices, triangles, points[near])) > 0.5]
+    near = np.zeros(0, int)
+    if len(triangles) and len(points):
+        near = np.flatnonzero(may_be_inside(points, vertices, triangles))
     if len(near):
-        corners = vertices[triangles]
-        depth[near] = _distances(points[near], vertices, triangles, corners.min(1), corners.max(1))
+        near = near[np.asarray(igl.fast_winding_number(vertices, triangles, points[near])) > 0.5]
+    if len(near) == 0:
+        return Inside(near, np.zeros(0), near, np.zeros((0, 3)))
+    corners = vertices[triangles]
+    return Inside(near, *_nearest(points[near], vertices, triangles, corners.min(1), corners.max(1)))
+
+
+def inside_depths(
+    points: Float[np.ndarray, "points 3"], vertices: Float[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "t 3"]
+) -> Float[np.ndarray, " points"]:
+    """Depth [m] of points inside a surface, 0 for those outside."""
+    found, depth = find_inside(points, vertices, triangles), np.zeros(len(points))
+    depth[found.points] = found.depth
     return depth
 
 
@@ -102,24 +118,24 @@ def may_be_inside(
     return may
 
 
-def _distances(
+def _nearest(
     points: Float[np.ndarray, "points 3"], vertices: Float[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "t 3"],
     low: Float[np.ndarray, "t 3"], high: Float[np.ndarray, "t 3"],
-) -> Float[np.ndarray, " points"]:  # fmt: skip
-    """Distance [m] of points to triangles, whose boxes are given. Those that are apart, as under two arms, are
-    measured apart."""
+) -> tuple[Float[np.ndarray, " points"], Int[np.ndarray, " points"], Float[np.ndarray, "points 3"]]:  # fmt: skip
+    """Distance [m] of points to triangles, whose boxes are given, the nearest triangle and the place on it. Points that
+    are apart, as under two arms, are measured apart."""
     import igl
 
     axis = int(np.ptp(points, axis=0).argmax())
     order = np.argsort(points[:, axis])
     gaps = np.diff(points[order, axis])
     if len(gaps) and gaps.max() > APART:
-        cut, distances = int(gaps.argmax()) + 1, np.zeros(len(points))
-        for some in (order[:cut], order[cut:]):
-            distances[some] = _distances(points[some], vertices, triangles, low, high)
-        return distances
+        cut, back = int(gaps.argmax()) + 1, np.argsort(order)
+        parts = [_nearest(points[some], vertices, triangles, low, high) for some in (order[:cut], order[cut:])]
+        distance, triangle, place = (np.concatenate(both)[back] for both in zip(*parts, strict=True))
+        return distance, triangle, place
     # no point is further from the surface than from some of its vertices
     bound = cdist(points, vertices[triangles[::EVERY, 0]]).min(1)[:, None]
-    near = ((high >= (points - bound).min(0)) & (low <= (points + bound).max(0))).all(-1)
-    squared = np.asarray(igl.point_mesh_squared_distance(points, vertices, triangles[near])[0])
-    return np.sqrt(np.maximum(squared, 0.0))
+    near = np.flatnonzero(((high >= (points - bound).min(0)) & (low <= (points + bound).max(0))).all(-1))
+    squared, triangle, place = igl.point_mesh_squared_distance(points, vertices, triangles[near])
+    return np.sqrt(np.maximum(np.asarray(squared), 0.0)), near[np.asarray(triangle)], np.asarray(place)

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from motionfit import rotation
 from motionfit._motion import Kinematics
@@ -117,6 +117,36 @@ class SkinClearance(Term):
     def residual(self, kin: Kinematics) -> Float[Array, "frames points"]:
         excess = [d - jnp.asarray(a) for d, a in zip(self.point_depths(kin), self.allowed, strict=True)]
         return hinge(jnp.concatenate(excess, axis=-1), self.width) / self.sigma
+
+
+class TouchClearance(Term):
+    """Vertices of one part's skin against the places on another's that they are nearest to.
+
+    These are the contacts of rigid-body dynamics, found on the posed skin and linearised: the depth of a touch is the
+    way from the vertex to its place, along the surface's normal there. `blend` holds that way as a sum over the
+    joints, skin weight times bind-pose position (homogeneous), so that (4.20) is one product; the `normals` turn with
+    the joints `carried_by`. Exact in the pose in which it was found, where a field of one pose is not, and of first
+    order around it. `allowed` [m] is the depth that does not count, per frame and touch; `sigma` [m].
+    """
+
+    blend: Float[AnyArray, "frames touches joints 4"]
+    normals: Float[AnyArray, "frames touches 3"]
+    carried_by: Int[AnyArray, "frames touches"]
+    allowed: Float[AnyArray, "frames touches"]
+    sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.01)
+    width: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.002)
+
+    def depth(self, kin: Kinematics) -> Float[Array, "frames touches"]:
+        """Depth [m] of every touch; negative where there is a gap."""
+        turns, shifts = kin.skin_transforms()
+        moves = jnp.concatenate([turns, shifts[..., None]], axis=-1)
+        ways = jnp.einsum("tjab,tnjb->tna", moves, jnp.asarray(self.blend, moves.dtype))
+        carried = jnp.take_along_axis(turns, jnp.asarray(self.carried_by)[..., None, None], axis=1)
+        normals = rotation.matrix_times(carried, jnp.asarray(self.normals, moves.dtype))
+        return jnp.sum(normals * ways, axis=-1)
+
+    def residual(self, kin: Kinematics) -> Float[Array, "frames touches"]:
+        return hinge(self.depth(kin) - jnp.asarray(self.allowed), self.width) / self.sigma
 
 
 class SkinContact(Term):

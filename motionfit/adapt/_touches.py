@@ -1,0 +1,117 @@
+"""Where the skins of two parts touch in the frames that were looked at, as rows for the solver.
+
+Near a shoulder the fold of the skin is not where a field of one pose says. The skin itself tells where it is, but only
+in the pose that was looked at: so what is found there is kept from round to round, and stands for the frames around.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+
+from motionfit._character import Character
+from motionfit._motion import bind_pose
+from motionfit.metrics import Direction
+from motionfit.shape.surface import Inside, part_surface
+from motionfit.terms.penetration import TouchClearance
+
+AT_ONCE = 6  # touches of two parts in one look, each way, at most
+APART = 0.015  # [m] between two of them
+KEPT = 24  # of a block in one look, the latest ones first
+NEVER = 1e3  # [m] allowed where there is no touch
+
+
+class Touches(NamedTuple):
+    """Touches of one look by vertex number: the same vertices touch on another body of the same topology."""
+
+    pairs: Int[np.ndarray, " touches"]
+    vertices: Int[np.ndarray, " touches"]
+    corners: Int[np.ndarray, "touches 3"]  # of the triangles that they are nearest to
+    shares: Float[np.ndarray, "touches 3"]  # of the corners in the nearest place
+    normals: Float[np.ndarray, "touches 3"]  # outward, in the bind pose, where the joints `carried_by` take them
+    carried_by: Int[np.ndarray, " touches"]
+
+    def only(self, some) -> "Touches":
+        return Touches(*(x[some] for x in self))
+
+    def then(self, others: "Touches") -> "Touches":
+        return Touches(*(np.concatenate(both) for both in zip(self, others, strict=True)))
+
+
+NONE = Touches(*(np.zeros((0, *shape), kind) for shape, kind in
+                 (((), int), ((), int), ((3,), int), ((3,), float), ((3,), float), ((), int))))  # fmt: skip
+
+
+def touches_of(
+    character: Character, rotations_world: Float[np.ndarray, "joints 4"], vertices: Float[np.ndarray, "vertices 3"],
+    found: Mapping[Direction, Inside], least: Float[np.ndarray, " pairs"],
+) -> Touches:  # fmt: skip
+    """The deepest places of one posed frame, some way apart, that are deeper than `least` [m] of their pair."""
+    from trimesh.triangles import points_to_barycentric
+
+    skin, touches = character.skin, NONE
+    to_bind = (Rotation.from_quat(bind_pose(character.skeleton)[1], scalar_first=True)
+               * Rotation.from_quat(rotations_world, scalar_first=True).inv())  # fmt: skip
+    for (pair, _, part), inside in found.items():
+        chosen = _deepest(vertices[inside.points], inside.depth, max(float(least[pair]), 1e-4))
+        if len(chosen) == 0:
+            continue
+        surface = part_surface(character, part)
+        corners = surface.used[surface.triangles[inside.triangles[chosen]]]
+        places, points = inside.places[chosen], inside.points[chosen]
+        carried_by = skin.main_joint[corners[:, 0]]
+        normals = to_bind[carried_by].apply((places - vertices[points]) / inside.depth[chosen, None])
+        shares = np.nan_to_num(points_to_barycentric(vertices[corners], places), nan=1 / 3)  # NaN: a flat triangle
+        touches = touches.then(Touches(np.full(len(chosen), pair), points, corners, shares, normals, carried_by))
+    return touches
+
+
+def touch_term(
+    character: Character, looks: Mapping[int, Touches], columns: list[int],
+    allowed: Mapping[int, Float[np.ndarray, " pairs"]], frames: int, length: int,
+) -> TouchClearance:  # fmt: skip
+    """The rows of a block, whose pairs are `columns`: each of `frames` has the touches of the look nearest to it. The
+    frames after them, up to `length`, only fill a bucket."""
+    joints = len(character.skeleton.names)
+    at = np.array(sorted(looks)) if looks else np.zeros(1, int)
+    blend, normals = np.zeros((len(at), KEPT, joints, 4), np.float32), np.zeros((len(at), KEPT, 3))
+    carried_by, may = np.zeros((len(at), KEPT), np.int32), np.full((len(at), KEPT), NEVER)
+    for i, frame in enumerate(at if looks else ()):
+        touches = looks[frame].only(np.isin(looks[frame].pairs, columns))
+        touches = touches.only(slice(KEPT))
+        count = len(touches.pairs)
+        blend[i, :count], normals[i, :count] = ways(character, touches), touches.normals
+        carried_by[i, :count], may[i, :count] = touches.carried_by, allowed[frame][touches.pairs]
+    nearest = np.abs(np.arange(frames)[:, None] - at).argmin(1)
+    filling = length - frames
+    nearest = np.pad(nearest, (0, filling), "edge")
+    may = np.concatenate([may[nearest[:frames]], np.full((filling, KEPT), NEVER)])
+    return TouchClearance(blend[nearest], normals[nearest], carried_by[nearest], may)
+
+
+def ways(character: Character, touches: Touches) -> Float[np.ndarray, "touches joints 4"]:
+    """From each vertex to its place as a sum over the joints: skin weight times bind-pose position, homogeneous."""
+    skin, order = character.skin, np.arange(len(touches.vertices))
+    result = np.zeros((len(order), len(character.skeleton.names), 4))
+    joints, weights = np.asarray(skin.joints), np.asarray(skin.weights, float)
+    points = np.pad(np.asarray(skin.vertices_bind, float), ((0, 0), (0, 1)), constant_values=1.0)
+    for vertices, share in (
+        (touches.vertices, -np.ones(len(order))),
+        *zip(touches.corners.T, touches.shares.T, strict=True),
+    ):
+        for k in range(joints.shape[1]):
+            own = (share * weights[vertices, k])[:, None] * points[vertices]
+            np.add.at(result, (order, joints[vertices, k]), own)
+    return result
+
+
+def _deepest(
+    points: Float[np.ndarray, "points 3"], depth: Float[np.ndarray, " points"], least: float
+) -> Int[np.ndarray, " chosen"]:
+    left, chosen = np.where(depth > least, depth, 0.0), []
+    while len(chosen) < AT_ONCE and left.max(initial=0.0) > 0.0:
+        chosen.append(int(left.argmax()))
+        left[np.linalg.norm(points - points[chosen[-1]], axis=-1) < APART] = 0.0
+    return np.array(chosen, int)
