@@ -117,7 +117,7 @@ def limbs(
     excess = before - own
     # a pair that shows no violation is left alone; near the shoulder the skin knows better than the fields
     slack = np.where([p.first.endswith("upper_arm") for p in pairs], 2.0, 1.0)
-    looks, beyond = None, np.zeros_like(own)
+    looks = None
     if reference is None or objective != "vertex":
         quiet = (before - np.maximum(own, joint_own)).max(axis=0) <= TOLERANCE
     else:
@@ -125,24 +125,23 @@ def limbs(
         on_skin = looks.depths(small)
         quiet = (before - np.maximum(own, joint_own)).max(axis=0) <= slack * TOLERANCE
         quiet &= looks.quiet(on_skin, small)
-        beyond = np.where(quiet, 0.0, looks.beyond(on_skin, excess, ALLOWED_EXCESS))
-    kept = own + allowance(excess + beyond, ALLOWED_EXCESS, MARGIN)
+    kept = own + allowance(excess, ALLOWED_EXCESS, MARGIN)
     # parts that do not meet at a joint touch less on the reference once the clip is adapted: what is kept must pass
     # for no violation then either, and is still a touch
     kept = np.where([p.adjacent for p in pairs], kept, np.minimum(kept, ENOUGH * TOLERANCE))
     if start is not None:
         _check_start(start, seen, pairs)
-        beyond = np.where(quiet, 0.0, np.maximum(beyond, start.details["held_back_m"]))
     allowed = np.where(quiet, np.maximum(before, own), kept)
+    held_back = np.zeros_like(own) if start is None else np.where(quiet, 0.0, start.details["held_back_m"])
 
-    stages = _stages(character, blocks, pairs, objective, allowed, quiet, looks is not None)
+    stages = _stages(character, blocks, pairs, objective, allowed - held_back, quiet, looks is not None)
     smooth, history, moved = jerk_scale(base), [], small
     # by name: later blocks may have added controls of their own
     points = (Correction.zero(seen.controls).points if start is None
               else [start.correction[c.name] for c in seen.controls])  # fmt: skip
     # a whole clip has no more control points than the bucket that the solver sees
     correction = Correction(seen.controls, tuple(_filled(p, seen.basis.count) for p in points))
-    best, since = Iterate((np.inf,), correction, None, before, beyond, np.inf), 0
+    best, since = Iterate((np.inf,), correction, None, before, held_back, np.inf), 0
     steps = sweeps * len(stages)
 
     def told(round_: int):
@@ -151,14 +150,13 @@ def limbs(
         return lambda name, done, _: progress(name, round_ * steps + done, ROUNDS * steps)  # pyright: ignore[reportOptionalCall]
 
     for round_ in range(ROUNDS):
-        problem = _problem(character, seen, stages, beyond, smooth, everything, (small, moved), looks)
+        problem = _problem(character, seen, stages, smooth, everything, (small, moved), looks)
         result = fit(problem, _side_by_side(stages), sweeps, correction=correction, progress=told(round_))
         if not round_ and start is None:
             result = _from_elsewhere(problem, result, stages)
         correction, history = result.correction, [*history, *result.history]
         moved = result.motion[np.arange(small.frame_count)]
-        used = allowed if not round_ else np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
-        used = used - beyond
+        used = np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
         after = volume_depths(everything, moved)
         if looks is None:
             over = left = np.where(quiet, 0.0, after - own)
@@ -174,14 +172,13 @@ def limbs(
             if left.max() <= ENOUGH * TOLERANCE:
                 looks.foresee(moved)
             over = looks.joined(after - own, on_skin - looks.basis, quiet)
-            beyond = np.where(quiet, 0.0, looks.beyond(on_skin, after - own, ALLOWED_EXCESS, beyond))
         jerk = derivative_ratio(_final(controls, whole, correction).apply(base), base, 3) or 1.0
         faults = (max(jerk - MOST_JERK, 0.0) / 0.1 + _amount(left) / TOLERANCE, _amount(over))
         # one that was looked at in fewer frames cannot be compared
         if faults < best.faults or round_ in CLOSER:
             best, since = Iterate(faults, correction, result.problem, after, allowed - used, left.max(initial=0.0)), 0
         since += 1
-        if not any(faults) or since > PATIENCE:
+        if (not any(faults) and round_ >= CLOSER[-1]) or since > PATIENCE:
             break
         if jerk > MOST_JERK:
             smooth *= 0.5
@@ -326,7 +323,7 @@ def _own_sets(everything: Clearance, stage: Stage) -> Bool[np.ndarray, " sets"]:
 
 
 def _problem(
-    character: Character, seen: Seen, stages: list[Stage], beyond: Float[np.ndarray, "frames pairs"], smooth: float,
+    character: Character, seen: Seen, stages: list[Stage], smooth: float,
     everything: Clearance, motions: tuple[Motion, ...], looks: SkinLooks | None,
 ) -> Problem:  # fmt: skip
     """The terms of all stages; probes are chosen by what they had to do with in `motions`."""
@@ -338,7 +335,7 @@ def _problem(
         scores = np.sum([support(everything, motion, allowed) for motion in motions], axis=0)
     for stage in stages:
         # however much the skin shows: a part that is LEAST_GAP away from the other's field is pushed no further
-        limit = np.maximum(stage.allowed - beyond[:, stage.columns], -LEAST_GAP)
+        limit = np.maximum(stage.allowed, -LEAST_GAP)
         limit = np.where(stage.quiet, stage.allowed, smooth_floor(limit, float(seen.motion.dt)))
         # the frames that only fill the bucket cost nothing
         limit = np.concatenate([limit, np.full((length - real, limit.shape[1]), 1e3)])

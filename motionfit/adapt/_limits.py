@@ -16,7 +16,6 @@ from motionfit.terms.penetration import TouchClearance
 LEAST_LOOKS, LOOK_SHARE = 16, 1 / 15  # looks at the skin: at least, and per frame that the solver sees
 NEARLY = 0.9  # of TOLERANCE: what passes for no violation, since between two looks there may be a little more
 LOOKS_APART = 2  # [frames] that two looks are at least apart
-LOOK_STEP = 0.007  # [m]
 ENOUGH = 0.7  # of TOLERANCE: what a look may still show
 SHOULDER_SLACK = 1.25  # of the tolerance at the armpit, whose overlap at ease varies with the pose
 HALF_RAISED = tuple(np.deg2rad((18.0, 25.0, 55.0, 75.0)))  # [rad] from the trunk's axis down
@@ -59,7 +58,7 @@ class SkinLooks:
     """Looks at the skinned mesh itself, at some frames of a clip.
 
     Near the shoulder the skin follows arm and trunk at once, and the fold of the joint is not quite where a field of
-    one pose says. `beyond` says by how much, and the solver allows that much less.
+    one pose says. So what touches in a look becomes rows for the solver.
     """
 
     def __init__(self, clip: Motion, character: Character, reference: Character, pairs: tuple[Pair, ...]):
@@ -145,30 +144,6 @@ class SkinLooks:
         excess = excess.copy()
         excess[self.at] = np.maximum(excess[self.at], on_skin)
         return np.where(quiet, 0.0, excess)
-
-    def beyond(
-        self,
-        seen: Float[np.ndarray, "looks pairs"],
-        excess: Float[np.ndarray, "frames pairs"],
-        allowed: float,
-        before: Float[np.ndarray, "frames pairs"] | None = None,
-    ) -> Float[np.ndarray, "frames pairs"]:
-        """How much less than `allowed` [m] the fields' excess may be, so that the skin shows no violation either.
-
-        Without `before`, what the skin shows more than the fields do. Else, where a look still shows too much, a step
-        down from what the fields show there now: at an armpit a vertex is in by centimetres or out, so a step as
-        large as the violation would overshoot. Between two looks the greater of them counts.
-        """
-        over, shown = seen - self.basis, excess[self.at]
-        if before is None:
-            more = np.clip(np.where(seen > 0, over - shown, 0.0), 0.0, LOOK_STEP)
-        else:
-            down = allowed - shown + np.clip(over, 0.0, LOOK_STEP)
-            more = np.where(
-                (seen > 0) & (over > ENOUGH * TOLERANCE), np.maximum(down, before[self.at]), before[self.at]
-            )
-        after = np.searchsorted(self.at, self.frames)
-        return np.maximum(more[after], more[np.maximum(after - 1, 0)])
 
 
 def _half_raised(pair: Pair, motion: Motion) -> Float[np.ndarray, " frames"]:
