@@ -18,7 +18,7 @@ from motionfit._skeleton import SIDES
 from motionfit._types import InputError
 from motionfit.adapt._clearance import Clearance, allowance, build_clearance, reduced, support, volume_depths
 from motionfit.adapt._controls import arm_controls, leg_controls
-from motionfit.adapt._limits import ENOUGH, SkinLooks, reference_depths
+from motionfit.adapt._limits import ENOUGH, NEARLY, SkinLooks, reference_depths
 from motionfit.adapt._sampling import SOLVE_RATE, sampling
 from motionfit.metrics import TOLERANCE, derivative_ratio
 from motionfit.shape.pairs import Pair, pairs_of
@@ -48,6 +48,7 @@ WIDE = np.deg2rad(45.0)  # a turn that makes one look for a shorter way out
 # out, out and across: where an arm lies deep in a trunk or before it, each way out has a valley of its own
 STARTS = tuple(np.deg2rad(s) for s in ((30.0, 0.0, 0.0), (30.0, 30.0, 30.0), (30.0, -30.0, -30.0)))
 ROUNDS, PATIENCE = 9, 2  # rounds at most, and rounds without a better result
+FEW_FAULTS = 0.01
 CLOSER = (0, 1)  # rounds after which more frames are looked at
 
 
@@ -63,10 +64,10 @@ class Stage(NamedTuple):
 
 
 class Iterate(NamedTuple):
-    """A round's result; `faults` say how good it is: what is left and jerk over the limit, a tenth of which counts as
-    much as a tolerance in the mean; then the violations foreseen."""
+    """A round's result; `faults` say how good it is: what is left and what is foreseen, in tolerances in the mean over
+    the frames, and jerk over the limit, a tenth of which counts as much as one."""
 
-    faults: tuple[float, ...]
+    faults: float
     correction: Correction
     problem: Problem | None
     depths: Float[np.ndarray, "frames pairs"]
@@ -141,7 +142,7 @@ def limbs(
               else [start.correction[c.name] for c in seen.controls])  # fmt: skip
     # a whole clip has no more control points than the bucket that the solver sees
     correction = Correction(seen.controls, tuple(_filled(p, seen.basis.count) for p in points))
-    best, since = Iterate((np.inf,), correction, None, before, held_back, np.inf), 0
+    best, since = Iterate(np.inf, correction, None, before, held_back, np.inf), 0
     steps = sweeps * len(stages)
 
     def told(round_: int):
@@ -169,16 +170,17 @@ def limbs(
             quiet = quiet & ~woken
             stages = [_wake(s, woken[s.columns], kept[:, s.columns]) for s in stages]
             left = looks.joined(after - own, on_skin - looks.own, quiet)
-            if left.max() <= ENOUGH * TOLERANCE:
+            if left.max() <= NEARLY * TOLERANCE:
                 looks.foresee(moved)
             over = looks.joined(after - own, on_skin - looks.basis, quiet)
         jerk = derivative_ratio(_final(controls, whole, correction).apply(base), base, 3) or 1.0
-        faults = (max(jerk - MOST_JERK, 0.0) / 0.1 + _amount(left) / TOLERANCE, _amount(over))
+        faults = max(jerk - MOST_JERK, 0.0) / 0.1 + (_amount(left) + _amount(over)) / TOLERANCE
         # one that was looked at in fewer frames cannot be compared
         if faults < best.faults or round_ in CLOSER:
             best, since = Iterate(faults, correction, result.problem, after, allowed - used, left.max(initial=0.0)), 0
         since += 1
-        if (not any(faults) and round_ >= CLOSER[-1]) or since > PATIENCE:
+        done = faults < FEW_FAULTS and over.max(initial=0.0) <= NEARLY * TOLERANCE
+        if (done and round_ >= CLOSER[-1]) or since > PATIENCE:
             break
         if jerk > MOST_JERK:
             smooth *= 0.5
