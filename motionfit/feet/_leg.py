@@ -20,6 +20,7 @@ from motionfit._skeleton import SIDES, Skeleton
 from motionfit.feet._classics import foot_joints
 from motionfit.feet._detect import smooth
 from motionfit.feet._floor import Floor
+from motionfit.feet._knees import calm_knees
 from motionfit.feet._plants import Footplants, runs
 from motionfit.feet._root import horizontal_path, root_steps
 from motionfit.feet._sole import Sole, sole_paths
@@ -45,8 +46,18 @@ class Leg(NamedTuple):
     lateral: Float[np.ndarray, "frames 3"]
 
     @property
+    def bones(self) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]]:
+        """Lengths of thigh and shank [m]."""
+        return np.linalg.norm(self.knee - self.hip, axis=1), np.linalg.norm(self.ankle - self.knee, axis=1)
+
+    @property
     def length(self) -> Float[np.ndarray, " frames"]:
-        return np.linalg.norm(self.knee - self.hip, axis=1) + np.linalg.norm(self.ankle - self.knee, axis=1)
+        thigh, shank = self.bones
+        return thigh + shank
+
+    def moved(self, by: Float[np.ndarray, "frames 3"]) -> "Leg":
+        """The leg somewhere else, turned as it is."""
+        return self._replace(hip=self.hip + by, knee=self.knee + by, ankle=self.ankle + by)
 
 
 def hip_from_foot(
@@ -295,7 +306,10 @@ def with_leg_ik(
     targets = [leg.ankle + moves[:, side] for side, leg in enumerate(legs)]
     down = lowering(legs, targets, dt) if lift is None else np.full(base.frame_count, float(lift))
     below = np.array([0.0, 1.0, 0.0]) * down[:, None]
-    legs = [leg._replace(hip=leg.hip - below, knee=leg.knee - below, ankle=leg.ankle - below) for leg in legs]
+    # where a knee would turn more abruptly for it than in the clip, the hips give way
+    below -= calm_knees([target - leg.hip + below for leg, target in zip(legs, targets, strict=True)],
+                        [leg.ankle - leg.hip for leg in legs], [leg.bones for leg in legs], dt)  # fmt: skip
+    legs = [leg.moved(-below) for leg in legs]
     heights = paths[..., 1] + shift[:, 1:2] + moves[:, sole.side, 1]
     standing = rows >= 0
     dtype = np.asarray(base.root).dtype
