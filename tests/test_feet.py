@@ -34,6 +34,7 @@ from motionfit.feet import (
 )  # fmt: skip
 from motionfit.feet._detect import _without_fast_ends, smooth, two_state_path
 from motionfit.feet._plants import runs
+from motionfit.feet._root import SLOW, path_stretch
 from motionfit.feet._transfer import evaluate, integral
 from motionfit.metrics import posed_vertices
 from tests.helpers import jumping
@@ -174,6 +175,31 @@ def test_flight_keeps_its_displacement_and_carries_the_correction_on():
     np.testing.assert_array_equal(
         horizontal_path(root, offsets, np.full(frames, -1), speed, np.zeros(1, int), 1 / 60), root
     )
+
+
+def test_a_path_too_long_for_its_feet_is_shortened_in_flight_in_the_same_proportion():
+    """A run whose root flies faster than it goes in the stances: feet that allow 0.7 of its steps allow 0.7 of its
+    flights; an added shift would leave them too long."""
+    frames = 90
+    pace = 2.0 + np.sin(np.arange(frames - 1) / 7.0) ** 2
+    flying = (np.arange(frames) // 15) % 2 == 1
+    pace[flying[:-1]] *= 1.5
+    root = np.zeros((frames, 3))
+    root[1:, 2] = np.cumsum(pace) / 60
+    offsets = -0.7 * root[:, None]
+    moved = horizontal_path(root, offsets, np.where(flying, -1, 0), np.zeros((frames, 1)), np.zeros(1, int), 1 / 60)
+    np.testing.assert_allclose(moved, 0.7 * root, rtol=0.005, atol=1e-12)
+
+
+@given(st.integers(0, 10**6))
+def test_path_stretch_is_the_ridge_minimum(seed):
+    rng = np.random.default_rng(seed)
+    own, dt = 0.02 * rng.normal(size=(12, 3)), 1 / 60
+    steps = rng.uniform(0.6, 1.8) * own + 1e-3 * rng.normal(size=own.shape)
+    cost = lambda s: float(((steps - s * own) ** 2).sum() + 12 * (SLOW * dt) ** 2 * (s - 1) ** 2)  # noqa: E731
+    best: float = minimize_scalar(cost, bounds=(0.5, 2.0), method="bounded", options={"xatol": 1e-10}).x  # type: ignore
+    assert path_stretch(own, steps, dt) == pytest.approx(best, abs=1e-6)
+    assert path_stretch(own, own, dt) == 1.0 and path_stretch(own[:0], steps[:0], dt) == 1.0
 
 
 # --- heights ---------------------------------------------------------------------------------------------------------
