@@ -20,6 +20,7 @@ BRIEF = 0.0125  # [s] what the hips give way for longer than this costs more tha
 IDLE = 0.1  # weight of the moments in which a knee is calm enough: with none, those of the next step swing to and fro
 STEPS = 4  # within a hundredth of the least cost on every clip tried
 STRAIGHT = 0.1  # sine of the bend below which a knee's gain no longer grows
+NOTHING = 1e-6  # [m] less than this the hips need not give way: whoever follows them has fewer frames to solve
 DIFFERENCE = (1.0, -2.0, 1.0)
 
 
@@ -73,6 +74,7 @@ def calm_knees(
         if not pull.any():
             break
         move = move + solveh_banded(_banded(blocks), pull.reshape(-1), lower=True).reshape(frames, 3)
+    move[np.abs(move).max(1) < NOTHING] = 0.0
     return move
 
 

@@ -6,13 +6,14 @@ brought exactly to where it stands by the analytic leg of appendix C, and betwee
 passes over smoothly from one to the next.
 """
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d, maximum_filter1d
 from scipy.sparse import csr_array, diags_array, eye_array
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from motionfit._motion import Motion, bind_pose, host_kinematics
@@ -173,14 +174,21 @@ def pass_over(
     and leaves with the speed that it has, and goes from one plant to the next. `anywhere` leaves open where each
     plant is, so that only the steps inside it are given: plants with little time between them come together.
     """
-    frames, planted = len(moves), np.zeros(len(moves), bool)
+    given = np.zeros(moves.shape)
     for start, end in plants:
-        planted[start : end + 1] = True
-    given, own = np.where(planted[:, None], moves, 0.0), ~planted
-    if anywhere:
-        own[[start for start, _ in plants]] = True  # one unknown for the whole plant
-    if not own.any():
-        return given
+        given[start : end + 1] = moves[start : end + 1]
+    share, cost, solve = _calmest_way(len(moves), tuple(plants), dt, anywhere)
+    return given if solve is None else given - share @ solve(share.T @ (cost @ given))
+
+
+@functools.lru_cache(maxsize=4)
+def _calmest_way(frames: int, plants: tuple[tuple[int, int], ...], dt: float, anywhere: bool):
+    """What `pass_over` solves, for both feet: it is asked again where a sole that hangs on the shank is brought nearer.
+    Which unknown each frame takes part in, the cost's matrix, and the solution; None where nothing is open."""
+    own = np.ones(frames, bool)
+    for start, end in plants:
+        own[start : end + 1] = False
+        own[start] = anywhere  # one unknown for the whole plant
     open_frames = np.arange(frames) if anywhere else np.flatnonzero(own)
     share = csr_array((np.ones(len(open_frames)), (open_frames, (np.cumsum(own) - 1)[open_frames])),
                       shape=(frames, int(own.sum())))  # fmt: skip
@@ -188,8 +196,7 @@ def pass_over(
     if frames > 2:
         bend = diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(frames - 2, frames))  # pyright: ignore[reportArgumentType]: SciPy's stub
         cost = cost + (EASE / dt) ** 4 * (bend.T @ bend)
-    found = spsolve((share.T @ cost @ share).tocsc(), -(share.T @ (cost @ given)))
-    return given + share @ found.reshape(-1, moves.shape[1])
+    return share, cost, splu((share.T @ cost @ share).tocsc()).solve if own.any() else None
 
 
 def lowering(legs: list[Leg], targets: list[Float[np.ndarray, "frames 3"]], dt: float) -> Float[np.ndarray, " frames"]:
