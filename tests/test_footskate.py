@@ -34,7 +34,7 @@ from motionfit.feet._enforce import (
 from motionfit.feet._knees import BRIEF, PRICE, _banded, _normal_blocks, calm_knees, knee_bend
 from motionfit.feet._leg import _clearing, calm_feet, pass_over
 from motionfit.metrics import derivative_ratio
-from tests.helpers import jumping, random_motion, with_legs
+from tests.helpers import jumping, knee_accelerations, random_motion, with_legs
 
 SAME = 1e-9  # [m] "unchanged" in double precision
 
@@ -624,17 +624,6 @@ def test_root_method_on_every_clip(shared_data, male, folder):
             assert abs(np.angle((way @ [1, 1j]) / (source @ [1, 1j]), deg=True)) < 5, path.name
         if path.stem.startswith(("run", "16_36", "16_42", "16_01", "16_05")):
             assert (found.plants.labels == "none").any(), path.name
-
-
-def knee_accelerations(motion: mf.Motion) -> np.ndarray:
-    """Second differences of both knees' bend, in every frame."""
-    positions, joint = host_kinematics(motion)[0], motion.skeleton.joint
-    bends = []
-    for side in ("left", "right"):
-        hip, knee, ankle = (positions[:, joint(f"{side}_{r}")] for r in ("thigh", "calf", "foot"))
-        a, b = knee - hip, ankle - knee
-        bends.append(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(1)))
-    return np.abs(np.diff(bends, 2, axis=1))
 
 
 def test_a_swinging_foot_is_led_over_the_floor_without_a_kink():
