@@ -7,7 +7,8 @@ root path scaled along (as `onto` does) and as it was, which skates the most. Pr
 clips: the slide of the planted vertex (worst in a frame, and 95th percentile, before and after), how far the way's
 direction turns at worst (of clips that go further than a metre), its length over that of the same clip on the body
 as it is, over the legs' length from the hip to the floor (the foot under a longer shank stays as it is), the
-acceleration ratio, the deepest penetration, and the CPU time per frame.
+acceleration ratio, a knee's greatest angular acceleration over the clip's, the deepest penetration, and the CPU time
+per frame.
 """
 
 import argparse
@@ -21,7 +22,7 @@ from motionfit._motion import bind_pose
 from motionfit.feet import METHODS
 from motionfit.metrics import derivative_ratio
 from motionfit.shape.growth import grow
-from tests.helpers import with_legs
+from tests.helpers import knee_accelerations, with_legs
 
 CLIPS = (
     "bvh/02_01_walk", "bvh/05_01_slow_walk", "bvh/16_21_fast_walk", "bvh/16_36_run", "bvh/16_42_run_90deg_left_turn",
@@ -61,6 +62,7 @@ def measure(motion: mf.Motion, body: mf.Character, method: str) -> dict[str, flo
         "turned [deg]": float(turned),
         "way [m]": float(np.linalg.norm(now)),
         "acceleration": derivative_ratio(fit.motion, fit.base, 2) or np.nan,
+        "knee peak": float((knee_accelerations(fit.motion).max(1) / knee_accelerations(fit.base).max(1)).max()),
         "penetration [cm]": 100 * after["ground_penetration_max_m"],
         "CPU [us/frame]": 1e6 * seconds / motion.frame_count,
         "same rotations": float(fit.motion.rotations is fit.base.rotations),

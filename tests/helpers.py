@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from motionfit import Character, Motion, Skeleton, Skin
-from motionfit._motion import bind_pose, rest_motion
+from motionfit._motion import bind_pose, host_kinematics, rest_motion
 
 
 def random_motion(seed: int, joints: int, frames: int, rate: float = 60.0) -> Motion:
@@ -78,3 +78,14 @@ def jumping(body: Character, height: float, rate: float = 60.0) -> tuple[Motion,
     root = np.asarray(rest.root) + up[:, None] * [0.0, 1.0, 0.0] + np.clip(times, 0, flight)[:, None] * [0.0, 0.0, 0.8]
     rotations = np.repeat(np.asarray(rest.rotations), len(times), axis=0)
     return Motion(body.skeleton, root, rotations, 1 / rate), up > 0
+
+
+def knee_accelerations(motion: Motion) -> np.ndarray:
+    """Size of the second differences [rad] of both knees' bend: (2, frames - 2)."""
+    positions, joint = host_kinematics(motion)[0], motion.skeleton.joint
+    bends = []
+    for side in ("left", "right"):
+        hip, knee, ankle = (positions[:, joint(f"{side}_{r}")] for r in ("thigh", "calf", "foot"))
+        a, b = knee - hip, ankle - knee
+        bends.append(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(1)))
+    return np.abs(np.diff(bends, 2, axis=1))

@@ -15,6 +15,7 @@ from motionfit import samples
 from motionfit._character import PARTS
 from motionfit._motion import rest_motion
 from motionfit.feet import (
+    METHODS,
     Floor,
     Plant,
     catmull_rom,
@@ -34,6 +35,7 @@ from motionfit.feet import (
 )  # fmt: skip
 from motionfit.feet._detect import _without_fast_ends, smooth, two_state_path
 from motionfit.feet._plants import runs
+from motionfit.feet._root import SLOW, path_stretch
 from motionfit.feet._transfer import evaluate, integral
 from motionfit.metrics import posed_vertices
 from tests.helpers import jumping
@@ -176,6 +178,31 @@ def test_flight_keeps_its_displacement_and_carries_the_correction_on():
     )
 
 
+def test_a_path_too_long_for_its_feet_is_shortened_in_flight_in_the_same_proportion():
+    """A run whose root flies faster than it goes in the stances: feet that allow 0.7 of its steps allow 0.7 of its
+    flights; an added shift would leave them too long."""
+    frames = 90
+    pace = 2.0 + np.sin(np.arange(frames - 1) / 7.0) ** 2
+    flying = (np.arange(frames) // 15) % 2 == 1
+    pace[flying[:-1]] *= 1.5
+    root = np.zeros((frames, 3))
+    root[1:, 2] = np.cumsum(pace) / 60
+    offsets = -0.7 * root[:, None]
+    moved = horizontal_path(root, offsets, np.where(flying, -1, 0), np.zeros((frames, 1)), np.zeros(1, int), 1 / 60)
+    np.testing.assert_allclose(moved, 0.7 * root, rtol=0.005, atol=1e-12)
+
+
+@given(st.integers(0, 10**6))
+def test_path_stretch_is_the_ridge_minimum(seed):
+    rng = np.random.default_rng(seed)
+    own, dt = 0.02 * rng.normal(size=(12, 3)), 1 / 60
+    steps = rng.uniform(0.6, 1.8) * own + 1e-3 * rng.normal(size=own.shape)
+    cost = lambda s: float(((steps - s * own) ** 2).sum() + 12 * (SLOW * dt) ** 2 * (s - 1) ** 2)  # noqa: E731
+    best: float = minimize_scalar(cost, bounds=(0.5, 2.0), method="bounded", options={"xatol": 1e-10}).x  # type: ignore
+    assert path_stretch(own, steps, dt) == pytest.approx(best, abs=1e-6)
+    assert path_stretch(own, own, dt) == 1.0 and path_stretch(own[:0], steps[:0], dt) == 1.0
+
+
 # --- heights ---------------------------------------------------------------------------------------------------------
 
 
@@ -289,39 +316,113 @@ def test_a_sole_of_ten_thousand_vertices_is_thinned_out(average):
     assert len(find_sole(dense).vertices) < 120
     walk = samples.walk(cycles=1)
     assert (mf.detect_footplants(walk, dense).labels == mf.detect_footplants(walk, average).labels).mean() > 0.97
+    for method in METHODS:
+        fine, coarse = (mf.remove_footskate(walk, body, method) for body in (dense, average))
+        assert fine.status == coarse.status == "converged"
+        np.testing.assert_allclose(fine.motion.root, coarse.motion.root, atol=0.01)
 
 
-def test_feet_that_cannot_be_used_say_why(average):
-    skin = average.skin
-    inside_out = eqx.tree_at(lambda c: c.skin.faces, average, np.asarray(skin.faces)[:, ::-1])
-    with pytest.raises(mf.InputError, match="faces down"):
-        find_sole(inside_out)
-    foot = [average.skeleton.joint(f"{s}_{r}") for s in ("left", "right") for r in ("foot", "toe")]
-    joints = np.where(np.isin(skin.joints, foot), average.skeleton.joint("left_calf"), np.asarray(skin.joints))
-    footless = mf.Character(average.skeleton, mf.Skin(skin.vertices_bind, skin.faces, joints, skin.weights), "stump")
-    with pytest.raises(mf.InputError, match="stump: no vertex follows left_foot"):
-        mf.remove_footskate(samples.walk(cycles=1), footless)
+def footless(body: mf.Character) -> mf.Character:
+    """The same body with the skin of its feet on a shank."""
+    skin, joint = body.skin, body.skeleton.joint
+    feet = [joint(f"{s}_{r}") for s in ("left", "right") for r in ("foot", "toe")]
+    joints = np.where(np.isin(skin.joints, feet), joint("left_calf"), np.asarray(skin.joints))
+    return mf.Character(body.skeleton, mf.Skin(skin.vertices_bind, skin.faces, joints, skin.weights), "stump")
 
 
-def without_toes(body: mf.Character) -> mf.Character:
-    """The same body on a skeleton that has no toe joints."""
+def upside_down_feet(body: mf.Character) -> mf.Character:
+    """The same body with its feet mirrored in their own height: soles above, facing up."""
+    skin, vertices = body.skin, np.array(body.skin.vertices_bind)
+    feet = np.isin(body.part_of_vertex, [PARTS.index(f"{s}_foot") for s in ("left", "right")])
+    vertices[feet, 1] = vertices[feet, 1].max() + vertices[feet, 1].min() - vertices[feet, 1]
+    return mf.Character(body.skeleton, mf.Skin(vertices, skin.faces, skin.joints, skin.weights), "upside down")
+
+
+def inside_out(body: mf.Character) -> mf.Character:
+    return eqx.tree_at(lambda c: c.skin.faces, body, np.asarray(body.skin.faces)[:, ::-1])
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    ("change", "fact"),
+    [
+        (footless, "stump: no vertex follows left_foot"),
+        (lambda body: without(body, "foot", "toe"), "no joint found for left_foot, right_foot"),
+        (upside_down_feet, "upside down: no vertex of the left foot faces down"),
+        (inside_out, "no vertex of the left foot faces down"),
+    ],
+    ids=["no skin on the feet", "no foot joints", "upside down", "inside out"],
+)
+def test_feet_that_cannot_be_used_say_why_in_one_line(average, method, change, fact):
+    walk, body = samples.walk(cycles=1), change(average)
+    for call in (lambda: mf.remove_footskate(walk, body, method), lambda: mf.detect_footplants(walk, body)):
+        with pytest.raises(mf.InputError, match=fact) as said:
+            call()
+        assert "\n" not in str(said.value)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_feet_that_walk_upside_down_are_held_as_they_are(average, method):
+    """Turned over at the ankle: what is lowest then carries, and holds still."""
+    walk = samples.walk(cycles=2)
+    rotations = np.array(walk.rotations)
+    for side in ("left", "right"):
+        foot = walk.skeleton.joint(f"{side}_foot")
+        over = Rotation.from_quat(rotations[:, foot], scalar_first=True) * Rotation.from_rotvec([0.0, 0.0, np.pi])
+        rotations[:, foot] = over.as_quat(scalar_first=True)
+    found = mf.remove_footskate(mf.Motion(walk.skeleton, walk.root, rotations, walk.dt), average, method)
+    assert found.status == "converged" and np.isfinite(found.motion.rotations).all()
+    assert found.plants.planted.mean() > 0.4
+    assert found.measure(found.motion)["slide_max_m_s"] < found.measure(found.base)["slide_max_m_s"]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_motion_without_frames_is_refused(average, method):
+    with pytest.raises(mf.InputError, match="without frames"):
+        mf.remove_footskate(samples.walk(cycles=1)[:0], average, method)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("frames", [1, 2, 3])
+def test_clips_of_a_few_frames_are_answered(average, method, frames):
+    """One frame has nothing to correct and comes back; two and three are held like any others."""
+    walk = samples.walk(cycles=1)[:frames]
+    found = mf.remove_footskate(walk, average, method, vertical="none", lift=0.0)
+    assert found.status == "converged" and found.motion.frame_count == frames
+    assert json.dumps(found.report(), allow_nan=False)
+    after = found.measure(found.motion)["slide_max_m_s"]
+    if frames == 1:
+        assert after is None
+        np.testing.assert_allclose(
+            np.asarray(found.motion.root)[:, [0, 2]], np.asarray(walk.root)[:, [0, 2]], atol=SAME
+        )
+    else:
+        assert after < 1e-6 < found.measure(found.base)["slide_max_m_s"]
+
+
+def without(body: mf.Character, *roles: str) -> mf.Character:
+    """The same body on a skeleton that lacks some joints of both legs; their skin is on the joints above."""
     skeleton, skin = body.skeleton, body.skin
-    toes = [skeleton.joint(f"{s}_toe") for s in ("left", "right")]
-    keep = [j for j in range(len(skeleton.names)) if j not in toes]
-    new = {j: k for k, j in enumerate(keep)} | {j: keep.index(skeleton.parents[j]) for j in toes}
-    parents = [-1 if skeleton.parents[j] < 0 else new[skeleton.parents[j]] for j in keep]
+    gone = [skeleton.joint(f"{s}_{r}") for s in ("left", "right") for r in roles]
+    keep = [j for j in range(len(skeleton.names)) if j not in gone]
+
+    def kept(joint: int) -> int:
+        return keep.index(joint) if joint in keep else kept(skeleton.parents[joint])
+
+    parents = [-1 if skeleton.parents[j] < 0 else kept(skeleton.parents[j]) for j in keep]
     bare = mf.Skeleton([skeleton.names[j] for j in keep], parents, np.asarray(skeleton.offsets)[keep],
                        np.asarray(skeleton.rest_rotations)[keep])  # fmt: skip
-    joints = np.vectorize(new.get)(np.asarray(skin.joints))
-    return mf.Character(bare, mf.Skin(skin.vertices_bind, skin.faces, joints, skin.weights), "toeless")
+    joints = np.vectorize(kept)(np.asarray(skin.joints))
+    return mf.Character(bare, mf.Skin(skin.vertices_bind, skin.faces, joints, skin.weights), f"without {roles}")
 
 
-@pytest.mark.parametrize("method", ["root", "leg-ik", "adaptive"])
-def test_a_missing_toe_joint_is_no_obstacle(average, method):
-    toeless, walk = without_toes(average), samples.walk(cycles=2)
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("frames", [None, 1, 3])
+def test_a_missing_toe_joint_is_no_obstacle(average, method, frames):
+    toeless, walk = without(average, "toe"), samples.walk(cycles=2)[:frames]
     found = mf.remove_footskate(walk, toeless, method)
     assert np.isfinite(found.motion.rotations).all() and np.isfinite(found.motion.root).all()
-    assert found.plants.planted.any() and found.reachable.all()
+    assert found.plants.planted.any() and found.reachable.all() and found.status == "converged"
 
 
 # --- labels ------------------------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from motionfit._motion import Motion, bind_pose, rest_motion
 from motionfit.feet._classics import foot_joints
 from motionfit.feet._cycles import Constraint, find_constraints
 from motionfit.feet._floor import Floor
+from motionfit.feet._knees import calm_knees
 from motionfit.feet._leg import Leg, find_legs, leg_kinematics
 from motionfit.feet._plants import Footplants
 from motionfit.feet._sole import Sole, sole_paths
@@ -20,6 +21,8 @@ KNEE = (0.0, 2.7)  # [rad] how far a knee bends
 ANKLE = 1.2  # [rad] how far the ankle may be turned away from the clip, about each of its axes
 HIP = 1.0  # [rad] and the hip
 REACHED = 1e-4  # [m]
+HIPS = 2.0  # [rad/m] price of the hips' giving way (`calm_knees`): heels are held for seconds, and with 1 the whole
+# body trembled by half more on a clip of standing on straight legs
 RESTING = 0.03  # [m/s] a joint of a standing foot that moves faster does not rest: half a millimetre in 1/60 s
 
 
@@ -163,9 +166,14 @@ def enforce(
             _keep_foot_length(
                 paths[side][0], paths[side][1], goals[side], positions[:, mine[1]] - positions[:, mine[0]], ease
             )
+    legs = find_legs(skeleton, positions, rotations)
+    # a heel that is held leaves the tremor of its leg to the knee: the hips take some of it
+    move = calm_knees([path[0] - leg.hip for path, leg in zip(paths, legs, strict=True)],
+                      [leg.ankle - leg.hip for leg in legs], [leg.bones for leg in legs], dt, HIPS)  # fmt: skip
+    positions, legs = positions + move[:, None], [leg.moved(move) for leg in legs]
     local, reachable = np.array(base.rotations, float), np.ones((base.frame_count, 2), bool)
     worst = [0.0, 0.0]
-    for side, (mine, leg) in enumerate(zip(joints, find_legs(skeleton, positions, rotations), strict=True)):
+    for side, (mine, leg) in enumerate(zip(joints, legs, strict=True)):
         errors = _turn_leg(base, leg, mine, positions, rotations, paths[side], local)
         for part, error in enumerate(errors):
             for start, end, _ in goals[side][part]:
@@ -174,7 +182,8 @@ def enforce(
                     reachable[start : end + 1, side] = error[start : end + 1] < REACHED
     details = {"constraints": float(sum(len(part) for side in goals for part in side)),
                "ankle_error_max_m": worst[0], "toe_error_max_m": worst[1]}  # fmt: skip
-    moved = Motion(skeleton, base.root, local.astype(np.asarray(base.rotations).dtype), base.dt, base.translations)
+    root, before = np.asarray(base.root), np.asarray(base.rotations)
+    moved = Motion(skeleton, (root + move).astype(root.dtype), local.astype(before.dtype), base.dt, base.translations)
     return moved, reachable, details
 
 

@@ -6,13 +6,14 @@ brought exactly to where it stands by the analytic leg of appendix C, and betwee
 passes over smoothly from one to the next.
 """
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d, maximum_filter1d
 from scipy.sparse import csr_array, diags_array, eye_array
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from motionfit._motion import Motion, bind_pose, host_kinematics
@@ -20,6 +21,7 @@ from motionfit._skeleton import SIDES, Skeleton
 from motionfit.feet._classics import foot_joints
 from motionfit.feet._detect import smooth
 from motionfit.feet._floor import Floor
+from motionfit.feet._knees import calm_knees
 from motionfit.feet._plants import Footplants, runs
 from motionfit.feet._root import horizontal_path, root_steps
 from motionfit.feet._sole import Sole, sole_paths
@@ -45,8 +47,18 @@ class Leg(NamedTuple):
     lateral: Float[np.ndarray, "frames 3"]
 
     @property
+    def bones(self) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]]:
+        """Lengths of thigh and shank [m]."""
+        return np.linalg.norm(self.knee - self.hip, axis=1), np.linalg.norm(self.ankle - self.knee, axis=1)
+
+    @property
     def length(self) -> Float[np.ndarray, " frames"]:
-        return np.linalg.norm(self.knee - self.hip, axis=1) + np.linalg.norm(self.ankle - self.knee, axis=1)
+        thigh, shank = self.bones
+        return thigh + shank
+
+    def moved(self, by: Float[np.ndarray, "frames 3"]) -> "Leg":
+        """The leg somewhere else, turned as it is."""
+        return self._replace(hip=self.hip + by, knee=self.knee + by, ankle=self.ankle + by)
 
 
 def hip_from_foot(
@@ -162,14 +174,21 @@ def pass_over(
     and leaves with the speed that it has, and goes from one plant to the next. `anywhere` leaves open where each
     plant is, so that only the steps inside it are given: plants with little time between them come together.
     """
-    frames, planted = len(moves), np.zeros(len(moves), bool)
+    given = np.zeros(moves.shape)
     for start, end in plants:
-        planted[start : end + 1] = True
-    given, own = np.where(planted[:, None], moves, 0.0), ~planted
-    if anywhere:
-        own[[start for start, _ in plants]] = True  # one unknown for the whole plant
-    if not own.any():
-        return given
+        given[start : end + 1] = moves[start : end + 1]
+    share, cost, solve = _calmest_way(len(moves), tuple(plants), dt, anywhere)
+    return given if solve is None else given - share @ solve(share.T @ (cost @ given))
+
+
+@functools.lru_cache(maxsize=4)
+def _calmest_way(frames: int, plants: tuple[tuple[int, int], ...], dt: float, anywhere: bool):
+    """What `pass_over` solves, for both feet: it is asked again where a sole that hangs on the shank is brought nearer.
+    Which unknown each frame takes part in, the cost's matrix, and the solution; None where nothing is open."""
+    own = np.ones(frames, bool)
+    for start, end in plants:
+        own[start : end + 1] = False
+        own[start] = anywhere  # one unknown for the whole plant
     open_frames = np.arange(frames) if anywhere else np.flatnonzero(own)
     share = csr_array((np.ones(len(open_frames)), (open_frames, (np.cumsum(own) - 1)[open_frames])),
                       shape=(frames, int(own.sum())))  # fmt: skip
@@ -177,8 +196,7 @@ def pass_over(
     if frames > 2:
         bend = diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(frames - 2, frames))  # pyright: ignore[reportArgumentType]: SciPy's stub
         cost = cost + (EASE / dt) ** 4 * (bend.T @ bend)
-    found = spsolve((share.T @ cost @ share).tocsc(), -(share.T @ (cost @ given)))
-    return given + share @ found.reshape(-1, moves.shape[1])
+    return share, cost, splu((share.T @ cost @ share).tocsc()).solve if own.any() else None
 
 
 def lowering(legs: list[Leg], targets: list[Float[np.ndarray, "frames 3"]], dt: float) -> Float[np.ndarray, " frames"]:
@@ -295,7 +313,10 @@ def with_leg_ik(
     targets = [leg.ankle + moves[:, side] for side, leg in enumerate(legs)]
     down = lowering(legs, targets, dt) if lift is None else np.full(base.frame_count, float(lift))
     below = np.array([0.0, 1.0, 0.0]) * down[:, None]
-    legs = [leg._replace(hip=leg.hip - below, knee=leg.knee - below, ankle=leg.ankle - below) for leg in legs]
+    # where a knee would turn more abruptly for it than in the clip, the hips give way
+    below -= calm_knees([target - leg.hip + below for leg, target in zip(legs, targets, strict=True)],
+                        [leg.ankle - leg.hip for leg in legs], [leg.bones for leg in legs], dt)  # fmt: skip
+    legs = [leg.moved(-below) for leg in legs]
     heights = paths[..., 1] + shift[:, 1:2] + moves[:, sole.side, 1]
     standing = rows >= 0
     dtype = np.asarray(base.root).dtype

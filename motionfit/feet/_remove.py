@@ -138,6 +138,8 @@ def _sole_for(character: Character, named) -> Sole:
 def _plants(motion: Motion, character: Character, floor, labels) -> tuple[Footplants, Sole, Evidence]:
     """Footplants, the sole they refer to, and what is known of its vertices."""
     dt, frames = float(motion.dt), motion.frame_count
+    if frames == 0:
+        raise InputError("a motion without frames has no footplants; give one frame or more")
     if labels is None:
         sole = _sole_for(character, ())
         plants, evidence = detect(sole, motion, _as_floor(floor))

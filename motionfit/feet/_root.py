@@ -8,6 +8,7 @@ from motionfit.feet._plants import runs
 from motionfit.feet._transfer import place_at, transfer_instant
 
 CARRY = 0.2  # [s] of a stance next to a flight that say how the path is corrected there
+SLOW = 0.3  # [m/s] a root that moves slower says little about the proportion of its path
 SCALE_BOUNDS = (0.5, 2.0)  # of the root's up and down: outside, a clip that hardly moves would scale its noise
 
 
@@ -53,22 +54,33 @@ def horizontal_path(
 ) -> Float[np.ndarray, "frames 3"]:
     """The root path [m] whose horizontal part follows the planted vertices; heights stay.
 
-    In flight no vertex says how far the root goes: there it keeps its own displacement plus the correction of its
-    velocity in the stances before and after (their medians, so that the braking of a landing does not count),
-    passing over from one to the other. The source (T 6.2) leaves flight open.
+    In flight no vertex says how far the root goes: there it keeps its own displacement, in the proportion that the
+    stances show on the whole (`path_stretch`: a body flies faster than it goes on its feet), plus what its velocity
+    is further corrected by in the stances before and after (their medians, so that the braking of a landing does not
+    count), passing over from one to the other. The source (T 6.2) leaves flight open.
     """
     if len(root) < 2:
         return root.copy()
     steps, held = root_steps(offsets, standing_on, speed, foot_of)
-    own = np.diff(root, axis=0)
-    correction = np.where(held[:, None], steps - own, 0.0)
+    own = np.diff(root, axis=0) * [1.0, 0.0, 1.0]
+    stretch = path_stretch(own[held], steps[held], dt)
+    correction = np.where(held[:, None], steps - stretch * own, 0.0)
     correction[:, 1] = 0.0
     carry_over_flights(correction, held, dt)
+    correction += (stretch - 1.0) * own
     if not correction.any():
         return root.copy()
     moved = root.copy()
     moved[1:] += np.cumsum(correction, axis=0)
     return moved
+
+
+def path_stretch(own: Float[np.ndarray, "steps 3"], steps: Float[np.ndarray, "steps 3"], dt: float) -> float:
+    """The factor by which horizontal steps are longer than the clip's own on the whole [m both]: least squares,
+    drawn to 1 as far as the root hardly moves (`SLOW`), within `SCALE_BOUNDS`."""
+    prior = len(own) * (SLOW * dt) ** 2
+    squared = float(np.sum(own * own)) + prior
+    return float(np.clip(1.0 + np.sum((steps - own) * own) / squared, *SCALE_BOUNDS)) if squared else 1.0
 
 
 def carry_over_flights(correction: Float[np.ndarray, "steps 3"], held: Bool[np.ndarray, " steps"], dt: float) -> None:
