@@ -20,7 +20,7 @@ def program(fn: Callable) -> Callable:
 
     @functools.cache
     def jitted():
-        return eqx.filter_jit(fn, compiler_options=_options())
+        return eqx.filter_jit(fn, compiler_options=_options())  # pyright: ignore[reportCallIssue]
 
     @functools.wraps(fn)
     def call(*args, **kwargs):

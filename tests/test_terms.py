@@ -1,5 +1,6 @@
 """One contract for every term: rows per frame, finite, and gradients that central differences confirm."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,10 +11,12 @@ from motionfit import samples
 from motionfit._motion import rest_motion
 from motionfit.adapt import build_clearance
 from motionfit.adapt._clearance import row_depths
+from motionfit.adapt._touches import KEPT
 from motionfit.shape.pairs import pairs_of
 from motionfit.splines import bspline_basis
 from motionfit.terms.penetration import hinge
 from tests.helpers import central_difference
+from tests.test_touches import touches_in
 
 RELATIVE = 1e-4  # analytic against central differences in double precision
 
@@ -46,6 +49,9 @@ def _terms(character, motion):
             touching = depth - 1e-4 * np.where(np.arange(depth.shape[1]) % 2 == 0, 1.0, -1.0)
             yield f"{objective}-{block}-contact", clearance.allowing(touching)
             yield f"{objective}-{block}-deep", clearance.allowing(np.full_like(depth, -0.05))
+    _, touches = touches_in(character, motion, frames, looks=(1, 4))
+    yield "touches-contact", eqx.tree_at(lambda t: t.allowed, touches, np.asarray(touches.depth(kin)) - 1e-4)
+    yield "touches-deep", eqx.tree_at(lambda t: t.allowed, touches, np.full((frames, KEPT), -0.05))
     hand = (character.skeleton.joint("left_hand"),)
     yield "joint-tracking", mf.terms.JointTracking(hand, np.zeros((frames, 1, 3)), 0.1)
     yield "rotation-tracking", mf.terms.RotationTracking(hand, np.asarray(kin.rotations_world[:, hand]), 0.1)
@@ -62,7 +68,17 @@ def _level(kin, height):
 
 
 NAMES = [f"{o}-{b}-{k}" for o in ("vertex", "capsule", "joint") for b in ("arms", "legs") for k in ("contact", "deep")]
-NAMES += ["joint-tracking", "rotation-tracking", "effort", "smoothness", "robust", "during", "custom"]
+NAMES += [
+    "touches-contact",
+    "touches-deep",
+    "joint-tracking",
+    "rotation-tracking",
+    "effort",
+    "smoothness",
+    "robust",
+    "during",
+    "custom",
+]
 
 
 @pytest.fixture(scope="module")

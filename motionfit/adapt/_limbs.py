@@ -98,14 +98,15 @@ def limbs(
 ) -> Fit:
     """Take the arms out of the trunk and the thighs, and the legs out of each other.
 
-    The solver sees 30 frames per second, and the skin's probes that matter. Afterwards all probes are looked at, with
-    a reference also the skinned mesh itself at some frames, and the jerk; where more than the tolerance is left the
-    volumes get less room, where the jerk grew the correction gets smoother, and the blocks run again from where they
-    were.
+    The solver sees 30 frames per second, and the skin's probes that matter. An arm that turns far begins again from
+    other turns; the least cost counts. Afterwards all probes are looked at, with a reference also the skinned mesh
+    itself at some frames, and the jerk. Where the skins touch becomes rows of the solve, where more than the tolerance
+    is left the fields get less room, where the jerk grew the correction gets smoother, and the blocks run again from
+    where they were.
 
     `fit.details` holds per pair and seen frame (`["frames"]`) the excess depth [m] on the volumes before and after
-    (`["excess_before_m"]`, `["excess_after_m"]`), and how much less than the tolerance the fields were allowed in
-    the end (`["held_back_m"]`). `blocks` are run in the order given, `sweeps` times, starting from zero or from the
+    (`["excess_before_m"]`, `["excess_after_m"]`), and how much less than at first the fields were allowed in the end
+    (`["held_back_m"]`). `blocks` are run in the order given, `sweeps` times, starting from zero or from the
     result of an earlier `start` for the same clip.
     """
     base = onto(clip, character.skeleton)
@@ -142,6 +143,8 @@ def limbs(
               else [start.correction[c.name] for c in seen.controls])  # fmt: skip
     # a whole clip has no more control points than the bucket that the solver sees
     correction = Correction(seen.controls, tuple(_filled(p, seen.basis.count) for p in points))
+    if start is not None and looks is not None:
+        looks.depths_and_touches(_final(controls, whole, correction).apply(base)[seen.frames])
     best, since = Iterate(np.inf, correction, None, before, held_back, np.inf), 0
     steps = sweeps * len(stages)
 

@@ -40,14 +40,15 @@ from motionfit.adapt._clearance import Clearance, build_clearance, volume_depths
 from motionfit.adapt._limbs import ALLOWED_EXCESS, LIMBS, SOLVE_PROBES, Stage
 from motionfit.adapt._limbs import _stages as limb_stages
 from motionfit.adapt._limits import ENOUGH
+from motionfit.adapt._touches import touching_on
 from motionfit.banded import Banded
-from motionfit.metrics import TOLERANCE
+from motionfit.metrics import TOLERANCE, skin_depths
 from motionfit.shape.field import DepthField, Probes, standing, standing_vertices
 from motionfit.shape.growth import grow
 from motionfit.shape.pairs import pairs_of
 from motionfit.shape.surface import part_surface
 from motionfit.shape.volumes import allocate_vertices, fit_volumes
-from motionfit.terms.penetration import CapsuleClearance, SkinClearance
+from motionfit.terms.penetration import CapsuleClearance, SkinClearance, TouchClearance
 
 MAX_STEPS = 200
 WAYS = (1.0, -1.0)
@@ -162,7 +163,8 @@ class Held(NamedTuple):
         pairs = pairs_of(*recipes)
         nothing = np.zeros((frames, len(pairs)))
         stages = limb_stages(problem.character, recipes, pairs, "vertex" if SkinClearance in kinds else "capsule",
-                             nothing, np.zeros(len(pairs), bool))[::-1]  # fmt: skip
+                             nothing, np.zeros(len(pairs), bool),
+                             any(isinstance(t, TouchClearance) for t in problem.terms.values()))[::-1]  # fmt: skip
         points = tuple(_filled(fit.correction[c.name], c.basis.count) for c in problem.controls)
         held = cls(problem, reference, points, tuple(stages), frames, (), ())
         alone = tuple(held._alone(stage) for stage in stages)
@@ -179,7 +181,24 @@ class Held(NamedTuple):
             term = followed(self._term(stage), stage.clearance, problem.character, body)
             more = self._kept(stage, alone, body, reference or self.reference) - kept
             terms[name] = _allowing_more(term, np.pad(more, filling), stage.clearance)
+        for name, term in problem.terms.items():
+            if isinstance(term, TouchClearance):
+                terms[name] = touching_on(self._touching(term, reference), body)
         return Problem(body, onto(problem.motion, body.skeleton), terms, problem.controls, problem.weights)
+
+    def _touching(self, term: TouchClearance, reference: Character | None) -> TouchClearance:
+        """The touches with what another reference shows in the frames that were looked at. Where less was allowed than
+        the reference shows, since it will show less once the clip is adapted, that is held."""
+        if reference is None or self.reference is None or not len(term.found):
+            return term
+        looks, at = np.unique(np.asarray(term.found)[..., 0], return_inverse=True)
+        pairs = pairs_of(*(name for name in LIMBS if any(f"{s}_clearance" in self.problem.terms for s in NAMES[name])))
+        clip = self.problem.motion[looks]
+        before, after = (skin_depths(r, onto(clip, r.skeleton), pairs).depth for r in (self.reference, reference))
+        place = at.reshape(term.found.shape[:2]), np.asarray(term.found)[..., 1]
+        allowed = np.asarray(term.allowed)
+        shown = np.abs(allowed - before[place] - ALLOWED_EXCESS) < 1e-4
+        return eqx.tree_at(lambda t: t.allowed, term, allowed + np.where(shown, (after - before)[place], 0.0))
 
     def _term(self, stage: Stage) -> Seen:
         term = self.problem.terms[f"{stage.block.name}_clearance"]

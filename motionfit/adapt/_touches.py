@@ -7,6 +7,7 @@ in the pose that was looked at: so what is found there is kept from round to rou
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
@@ -52,8 +53,7 @@ def touches_of(
     from trimesh.triangles import points_to_barycentric
 
     skin, touches = character.skin, NONE
-    to_bind = (Rotation.from_quat(bind_pose(character.skeleton)[1], scalar_first=True)
-               * Rotation.from_quat(rotations_world, scalar_first=True).inv())  # fmt: skip
+    bind = bind_pose(character.skeleton)[1]
     for (pair, _, part), inside in found.items():
         chosen = _deepest(vertices[inside.points], inside.depth, max(float(least[pair]), 1e-4))
         if len(chosen) == 0:
@@ -62,49 +62,61 @@ def touches_of(
         corners = surface.used[surface.triangles[inside.triangles[chosen]]]
         places, points = inside.places[chosen], inside.points[chosen]
         carried_by = skin.main_joint[corners[:, 0]]
-        normals = to_bind[carried_by].apply((places - vertices[points]) / inside.depth[chosen, None])
+        home, away = (Rotation.from_quat(r[carried_by], scalar_first=True) for r in (bind, rotations_world))
+        normals = (home * away.inv()).apply((places - vertices[points]) / inside.depth[chosen, None])
         shares = np.nan_to_num(points_to_barycentric(vertices[corners], places), nan=1 / 3)  # NaN: a flat triangle
         touches = touches.then(Touches(np.full(len(chosen), pair), points, corners, shares, normals, carried_by))
     return touches
 
 
 def touch_term(
-    character: Character, looks: Mapping[int, Touches], columns: list[int],
+    character: Character, looks: Mapping[int, Touches], columns: Int[np.ndarray, " some"],
     allowed: Mapping[int, Float[np.ndarray, " pairs"]], frames: int, length: int,
 ) -> TouchClearance:  # fmt: skip
     """The rows of a block, whose pairs are `columns`: each of `frames` has the touches of the look nearest to it. The
     frames after them, up to `length`, only fill a bucket."""
-    joints = len(character.skeleton.names)
-    at = np.array(sorted(looks)) if looks else np.zeros(1, int)
-    blend, normals = np.zeros((len(at), KEPT, joints, 4), np.float32), np.zeros((len(at), KEPT, 3))
-    carried_by, may = np.zeros((len(at), KEPT), np.int32), np.full((len(at), KEPT), NEVER)
-    for i, frame in enumerate(at if looks else ()):
-        touches = looks[frame].only(np.isin(looks[frame].pairs, columns))
-        touches = touches.only(slice(KEPT))
-        count = len(touches.pairs)
-        blend[i, :count], normals[i, :count] = ways(character, touches), touches.normals
-        carried_by[i, :count], may[i, :count] = touches.carried_by, allowed[frame][touches.pairs]
+    at = np.array(sorted(looks) or [0])
+    kept = [looks.get(frame, NONE) for frame in at.tolist()]
+    kept = [t.only(np.flatnonzero(np.isin(t.pairs, columns))[:KEPT]) for t in kept]
+    may = [allowed[frame][t.pairs] if len(t.pairs) else np.zeros(0) for frame, t in zip(at.tolist(), kept, strict=True)]
     nearest = np.abs(np.arange(frames)[:, None] - at).argmin(1)
-    filling = length - frames
-    nearest = np.pad(nearest, (0, filling), "edge")
-    may = np.concatenate([may[nearest[:frames]], np.full((filling, KEPT), NEVER)])
-    return TouchClearance(blend[nearest], normals[nearest], carried_by[nearest], may)
+    nearest = np.pad(nearest, (0, length - frames), "edge")
+
+    def by_frame(rows: list[np.ndarray], filling: float = 0.0) -> np.ndarray:
+        short = [KEPT - len(r) for r in rows]
+        full = [np.pad(r, ((0, n), *((0, 0),) * (r.ndim - 1)), constant_values=filling)
+                for r, n in zip(rows, short, strict=True)]  # fmt: skip
+        return np.stack(full)[nearest]
+
+    limits = by_frame(may, NEVER)
+    limits[frames:] = NEVER
+    blend = [ways(character, t.vertices, t.corners, t.shares) for t in kept]
+    found = [np.column_stack([np.full(len(t.pairs), frame), t.pairs, t.vertices, t.corners])
+             for frame, t in zip(at.tolist(), kept, strict=True)]  # fmt: skip
+    normals, carried_by, shares = (by_frame([getattr(t, k) for t in kept]) for k in ("normals", "carried_by", "shares"))
+    return TouchClearance(by_frame(blend), normals, carried_by, limits, by_frame(found), shares)
 
 
-def ways(character: Character, touches: Touches) -> Float[np.ndarray, "touches joints 4"]:
+def ways(
+    character: Character, vertices: Int[np.ndarray, " touches"], corners: Int[np.ndarray, "touches 3"],
+    shares: Float[np.ndarray, "touches 3"],
+) -> Float[np.ndarray, "touches joints 4"]:  # fmt: skip
     """From each vertex to its place as a sum over the joints: skin weight times bind-pose position, homogeneous."""
-    skin, order = character.skin, np.arange(len(touches.vertices))
-    result = np.zeros((len(order), len(character.skeleton.names), 4))
+    skin, order = character.skin, np.arange(len(vertices))
     joints, weights = np.asarray(skin.joints), np.asarray(skin.weights, float)
     points = np.pad(np.asarray(skin.vertices_bind, float), ((0, 0), (0, 1)), constant_values=1.0)
-    for vertices, share in (
-        (touches.vertices, -np.ones(len(order))),
-        *zip(touches.corners.T, touches.shares.T, strict=True),
-    ):
+    result = np.zeros((len(order), len(character.skeleton.names), 4))
+    for some, share in ((vertices, -np.ones(len(order))), *zip(corners.T, shares.T, strict=True)):
         for k in range(joints.shape[1]):
-            own = (share * weights[vertices, k])[:, None] * points[vertices]
-            np.add.at(result, (order, joints[vertices, k]), own)
+            np.add.at(result, (order, joints[some, k]), (share * weights[some, k])[:, None] * points[some])
     return result
+
+
+def touching_on(term: TouchClearance, character: Character) -> TouchClearance:
+    """The same touches on a body of the same topology."""
+    found = np.asarray(term.found).reshape(-1, 6)
+    blend = ways(character, found[:, 2], found[:, 3:], np.asarray(term.shares).reshape(-1, 3))
+    return eqx.tree_at(lambda t: t.blend, term, blend.reshape(np.shape(term.blend)))
 
 
 def _deepest(

@@ -127,12 +127,17 @@ class TouchClearance(Term):
     joints, skin weight times bind-pose position (homogeneous), so that (4.20) is one product; the `normals` turn with
     the joints `carried_by`. Exact in the pose in which it was found, where a field of one pose is not, and of first
     order around it. `allowed` [m] is the depth that does not count, per frame and touch; `sigma` [m].
+
+    `found` tells what the same touch is on another body: the frame that was looked at, the pair of parts, the vertex
+    and the corners of the triangle that it is nearest to, with their `shares` in the place.
     """
 
     blend: Float[AnyArray, "frames touches joints 4"]
     normals: Float[AnyArray, "frames touches 3"]
     carried_by: Int[AnyArray, "frames touches"]
     allowed: Float[AnyArray, "frames touches"]
+    found: Int[AnyArray, "frames touches 6"]
+    shares: Float[AnyArray, "frames touches 3"]
     sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.01)
     width: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.002)
 

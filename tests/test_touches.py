@@ -1,0 +1,92 @@
+"""Touches of two skins against the skins themselves."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import motionfit as mf
+from motionfit import samples
+from motionfit._motion import host_kinematics
+from motionfit.adapt._touches import KEPT, NEVER, touch_term, touches_of, touching_on
+from motionfit.metrics import insides, posed_vertices
+from motionfit.shape import grow
+from motionfit.shape.pairs import pairs_of
+from motionfit.shape.surface import inside_depths, part_surface
+
+PAIRS = pairs_of("arms")
+LOOKS = (1, 6)
+
+
+@pytest.fixture(scope="module")
+def clip(heavy):
+    return mf.onto(samples.walk(cycles=1), heavy.skeleton)[:40:4]
+
+
+def touches_in(character, clip, length=12, looks=LOOKS):
+    rotations = host_kinematics(clip)[1]
+    found = {i: (vertices, inside) for i, vertices, inside in insides(character, clip, PAIRS)}
+    least = np.full(len(PAIRS), 0.004)
+    made = {f: touches_of(character, rotations[f], *found[f], least) for f in looks}
+    allowed = {f: np.arange(len(PAIRS)) * 0.001 for f in looks}
+    return made, touch_term(character, made, np.arange(len(PAIRS)), allowed, clip.frame_count, length)
+
+
+def test_in_the_pose_that_was_looked_at_a_touch_is_as_deep_as_the_skin_says(heavy, clip):
+    looks, term = touches_in(heavy, clip)
+    padded = clip[np.minimum(np.arange(12), clip.frame_count - 1)]
+    depth = np.asarray(term.depth(mf.forward_kinematics(heavy.skeleton, padded)))
+    posed = posed_vertices(heavy, clip).astype(float)
+    for frame in LOOKS:
+        touches = looks[frame]
+        assert len(touches.pairs) > 4
+        for k, (pair, vertex) in enumerate(zip(touches.pairs[:KEPT], touches.vertices[:KEPT], strict=True)):
+            exact = []
+            for part in PAIRS[pair][:2]:
+                mesh = part_surface(heavy, part)
+                exact.append(inside_depths(posed[frame, [vertex]], posed[frame, mesh.used], mesh.triangles)[0])
+            assert depth[frame, k] == pytest.approx(max(exact), abs=1e-5)
+            assert np.asarray(term.allowed)[frame, k] == pytest.approx(pair * 0.001)
+    # a frame has the touches of the look that is nearest, and what only fills the bucket has none
+    assert (np.asarray(term.found)[2, :4] == np.asarray(term.found)[1, :4]).all()
+    assert (np.asarray(term.found)[9, :4, 0] == LOOKS[1]).all()
+    assert (np.asarray(term.allowed)[clip.frame_count :] == NEVER).all()
+
+
+def ways_on(character, motion, term):
+    """From each vertex to its place [m], on the posed skin."""
+    posed, found = posed_vertices(character, motion).astype(float), np.asarray(term.found)
+    frames = np.arange(len(posed))[:, None]
+    places = np.einsum("tnk,tnka->tna", term.shares, posed[frames[..., None], found[..., 3:]])
+    return places - posed[frames, found[..., 2]]
+
+
+def test_a_touch_follows_its_skins_to_first_order(heavy, clip):
+    """In the pose that was looked at the rate of its depth is that of the distance from the vertex to its place."""
+    _, term = touches_in(heavy, clip, clip.frame_count)
+    shoulder, step, seen = heavy.skeleton.joint("left_upper_arm"), 1e-5, []
+    for angle in (step, -step):
+        rotations = np.array(clip.rotations, float)
+        turned = Rotation.from_quat(rotations[:, shoulder], scalar_first=True) * Rotation.from_rotvec([0, 0, angle])
+        rotations[:, shoulder] = turned.as_quat(scalar_first=True)
+        moved = dataclasses.replace(clip, rotations=rotations)
+        depth = np.asarray(term.depth(mf.forward_kinematics(heavy.skeleton, moved)))
+        seen.append((depth[LOOKS, :], np.linalg.norm(ways_on(heavy, moved, term), axis=-1)[LOOKS, :]))
+    told, shown = ((a - b) / (2 * step) for a, b in zip(*seen, strict=True))
+    real = (np.asarray(term.allowed) < NEVER)[LOOKS, :]
+    assert np.abs(shown[real]).max() > 0.1  # [m/rad]
+    np.testing.assert_allclose(told[real], shown[real], atol=2e-3)
+
+
+def test_touches_on_another_body_are_those_of_the_same_vertices(heavy, clip):
+    _, term = touches_in(heavy, clip, clip.frame_count)
+    body = grow(heavy, {"trunk": 1.1})
+    moved = mf.onto(clip, body.skeleton)
+    real = np.asarray(term.allowed) < NEVER
+    turns, shifts = mf.forward_kinematics(body.skeleton, moved).skin_transforms()
+    moves = np.concatenate([np.asarray(turns), np.asarray(shifts)[..., None]], axis=-1)
+    told = np.einsum("tjab,tnjb->tna", moves, touching_on(term, body).blend)
+    np.testing.assert_allclose(told[real], ways_on(body, moved, term)[real], atol=1e-6)
+    itself = np.asarray(touching_on(term, heavy).blend)
+    np.testing.assert_allclose(itself[real], np.asarray(term.blend)[real], atol=1e-12)
