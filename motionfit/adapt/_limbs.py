@@ -314,9 +314,11 @@ def _stages(
         for name, controls, mine in wanted:
             clearance = build_clearance(character, mine, objective)
             columns = [pairs.index(p) for p in clearance.pairs]
+            # fields see thighs well, and the fold between them, where they touch, opens in no one direction
+            touches = (f"{name}_touches",) if touching and recipe == "arms" else ()
             # a foot that stands shall not slide; arms may come and go
-            terms = (f"{name}_clearance", *((f"{name}_touches",) if touching else ()), "effort", "smoothness",
-                     *(("steadiness",) if recipe == "legs" else ()))  # fmt: skip
+            steady = ("steadiness",) if recipe == "legs" else ()
+            terms = (f"{name}_clearance", *touches, "effort", "smoothness", *steady)
             block = Block(name, controls, terms, max_steps=24, tolerance=1e-3)
             made.append(Stage(block, clearance, columns, allowed[:, columns], quiet[columns]))
     return made
@@ -349,7 +351,7 @@ def _problem(
             terms[name] = reduced(stage.clearance, scores[_own_sets(everything, stage)], limit, SOLVE_PROBES)  # pyright: ignore[reportArgumentType]
         else:
             terms[name] = stage.clearance.allowing(limit)
-        if looks is not None:
+        if looks is not None and f"{stage.block.name}_touches" in (stage.block.terms or ()):
             awake = np.array(stage.columns)[~stage.quiet]
             terms[f"{stage.block.name}_touches"] = looks.touch_term(awake, ALLOWED_EXCESS, length)
     frames = np.arange(length)
