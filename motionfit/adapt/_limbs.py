@@ -117,13 +117,14 @@ def limbs(
     own, joint_own = reference_depths(clip[seen.frames], character, reference, pairs, objective)
     before = volume_depths(everything, small)
     excess = before - own
-    # a pair that shows no violation is left alone; near the shoulder the skin knows better than the fields
-    slack = np.where([p.first.endswith("upper_arm") for p in pairs], 2.0, 1.0)
+    # a pair that shows no violation is left alone; near the shoulder the skin alone knows
+    slack = np.where([p.first.endswith("upper_arm") for p in pairs], np.inf, 1.0)
     looks = None
     if reference is None or objective != "vertex":
         quiet = (before - np.maximum(own, joint_own)).max(axis=0) <= TOLERANCE
     else:
         looks = SkinLooks(clip[seen.frames], character, reference, pairs)
+        looks.look_closer(excess.max(axis=1))
         on_skin = looks.depths(small)
         quiet = (before - np.maximum(own, joint_own)).max(axis=0) <= slack * TOLERANCE
         quiet &= looks.quiet(on_skin, small)
@@ -169,7 +170,7 @@ def limbs(
                 looks.look_closer((after - own).max(axis=1))
             on_skin = looks.depths_and_touches(moved)
             # what the first looks missed
-            woken = quiet & ~looks.quiet(on_skin, moved, 1.0)
+            woken = quiet & ~looks.quiet(on_skin, moved)
             quiet = quiet & ~woken
             stages = [_wake(s, woken[s.columns], kept[:, s.columns]) for s in stages]
             left = looks.joined(after - own, on_skin - looks.own, quiet)

@@ -14,7 +14,7 @@ from motionfit.shape.pairs import Pair
 from motionfit.terms.penetration import TouchClearance
 
 LEAST_LOOKS, LOOK_SHARE = 16, 1 / 15  # looks at the skin: at least, and per frame that the solver sees
-NEARLY = 0.9  # of TOLERANCE: what passes for no violation, since between two looks there may be a little more
+NEARLY = 0.9  # of TOLERANCE: what a result may show, since between two looks there may be a little more
 LOOKS_APART = 2  # [frames] that two looks are at least apart
 ENOUGH = 0.7  # of TOLERANCE: what a look may still show
 SHOULDER_SLACK = 1.25  # of the tolerance at the armpit, whose overlap at ease varies with the pose
@@ -115,11 +115,9 @@ class SkinLooks:
             self.own, self.basis = (np.concatenate([x, more])[order] for x in (self.own, self.basis))
             self.at = at[order]
 
-    def quiet(
-        self, seen: Float[np.ndarray, "looks pairs"], motion: Motion, share: float = NEARLY
-    ) -> Bool[np.ndarray, " pairs"]:
-        """The pairs that show no more than a share of the tolerance in any look at `motion`, of the solver's frames."""
-        return (seen <= self._passes(self.own, motion) + share * TOLERANCE).all(axis=0)  # pyright: ignore[reportReturnType]
+    def quiet(self, seen: Float[np.ndarray, "looks pairs"], motion: Motion) -> Bool[np.ndarray, " pairs"]:
+        """The pairs that show no more than the tolerance in any look at `motion`, of the solver's frames."""
+        return (seen <= self._passes(self.own, motion) + TOLERANCE).all(axis=0)  # pyright: ignore[reportReturnType]
 
     def _passes(self, own: Float[np.ndarray, "looks pairs"], motion: Motion) -> Float[np.ndarray, "looks pairs"]:
         """The depth [m] that is none of the body's shape: what the reference shows in the frame or, within limits,
