@@ -10,6 +10,7 @@ row per clip and body.
 import argparse
 import pathlib
 import time
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -91,10 +92,12 @@ def constant_offset(fit: mf.Fit, character: mf.Character, own: np.ndarray, at: n
     return Motion(fit.base.skeleton, fit.base.root, rotations, fit.base.dt)
 
 
-def row(clip: Motion, character: mf.Character, reference: mf.Character, frames: int, offset: bool) -> dict:
+def row(
+    clip: Motion, character: mf.Character, reference: mf.Character, blocks: Sequence[str], frames: int, offset: bool
+) -> dict:
     """One clip on one body: shares of frames over 1 cm, inside ratios, deviations and smoothness."""
     started = time.perf_counter()
-    fit = mf.adapt(clip, character, reference=reference)
+    fit = mf.adapt(clip, character, reference=reference, blocks=blocks)
     seconds = time.perf_counter() - started
     step = max(1, fit.base.frame_count // frames)
     own = skin_depths(reference, mf.onto(clip, reference.skeleton), step=step)
@@ -129,6 +132,9 @@ def main() -> None:
     parser.add_argument("--bodies", nargs="*", default=BODIES)
     parser.add_argument("--reference", default="avg_male")
     parser.add_argument("--frames", type=int, default=80, help="frames looked at on the skin, per clip")
+    parser.add_argument(
+        "--blocks", default=",".join(mf.adapt.DEFAULT), help="an offset does the work of arms,legs only"
+    )
     parser.add_argument("--offset", action="store_true", help="compare with the best constant offset")
     options = parser.parse_args()
     keys: list[str] = []
@@ -146,7 +152,7 @@ def main() -> None:
             if scale:
                 reference = character
                 character = grow(character, dict.fromkeys(("arms", "legs", "trunk"), float(scale)))
-            found = row(clip, character, reference, options.frames, options.offset)
+            found = row(clip, character, reference, options.blocks.split(","), options.frames, options.offset)
             if not keys:
                 keys = list(found)
                 print("| clip | body | " + " | ".join(keys) + " |")

@@ -20,7 +20,8 @@ class Motion(eqx.Module):
 
     `root` [m] is the root joint's position in the world; `rotations` are joint-to-parent unit quaternions wxyz;
     `dt` [s] the time between frames. `translations` [m] are joint-to-parent positions for the rare file that
-    animates them (None: the skeleton's offsets hold).
+    animates them (None: the skeleton's offsets hold). An adapted clip remembers its `source`; what is cut from it or
+    moved further does not.
     """
 
     skeleton: Skeleton
@@ -28,6 +29,7 @@ class Motion(eqx.Module):
     rotations: Rotations
     dt: Float[AnyArray, ""] = eqx.field(converter=lambda x: np.asarray(x, float) if isinstance(x, float | int) else x)
     translations: Positions | None = None
+    source: "Source | None" = None
 
     def __check_init__(self):
         joints = len(self.skeleton.names)
@@ -49,6 +51,21 @@ class Motion(eqx.Module):
         """The motion of some frames, at the same dt."""
         translations = None if self.translations is None else self.translations[frames]
         return Motion(self.skeleton, self.root[frames], self.rotations[frames], self.dt, translations)
+
+    def source_on(self, body: str) -> "Motion":
+        """The clip that this one was adapted from, if that was to the same body (`Character.fingerprint`); else itself.
+
+        What a reference body shows has to be measured with it. The adapted clip leads the arms out, on the reference
+        too: there it shows less overlap than its source, and the little that may stay would pass for a violation.
+        """
+        return self.source.motion if self.source is not None and self.source.body == body else self
+
+
+class Source(eqx.Module):
+    """What an adapted clip was made from: the clip, frame by frame, and the fingerprint of the body it was made for."""
+
+    motion: Motion
+    body: str = eqx.field(static=True)
 
 
 def rest_motion(skeleton: Skeleton, dt: float = 1 / 60) -> Motion:

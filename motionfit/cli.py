@@ -75,7 +75,9 @@ def adapt(
 def metrics(
     clip: ClipArgument,
     character: CharacterArgument,
-    reference_clip: Annotated[str | None, typer.Option(help="the source clip that fidelity is against")] = None,
+    reference_clip: Annotated[
+        str | None, typer.Option(help="the source clip that fidelity is against; a file of `adapt` may hold it")
+    ] = None,
     reference: Annotated[str | None, typer.Option(help="the body that the clip was made for")] = None,
     json_file: Annotated[pathlib.Path | None, typer.Option("--json", help="write the measures here")] = None,
 ) -> None:
@@ -84,12 +86,12 @@ def metrics(
     from motionfit._progress import progress_bar
 
     body, motion = mf.load_character(character), _load_clip(clip)
-    source = motion if reference_clip is None else _load_clip(reference_clip)
+    source = motion.source_on(body.fingerprint) if reference_clip is None else _load_clip(reference_clip)
     if source.frame_count != motion.frame_count:
         raise mf.InputError(f"{reference_clip} has {source.frame_count} frames, {clip} has {motion.frame_count}; give "
                             "the clip that it was made from, cut and resampled alike")  # fmt: skip
     other = None if reference is None else mf.load_character(reference)
-    if other is not None and reference_clip is None:
+    if other is not None and source is motion:
         sys.stderr.write(f"motionfit: {reference} plays {clip} itself; if that is an adapted clip, add "
                          "--reference-clip and the clip that it was made from, or what it was adapted away from "
                          "is missing in the reference\n")  # fmt: skip
@@ -214,7 +216,7 @@ def run_adapt(
         progress.done("adapting")
         solve = time.perf_counter() - began
         motions = {"before": base, "after": base if fit is None else fit.motion}
-        measured = _measure_all(body, motions, base, motion, other, progress)
+        measured = _measure_all(body, motions, base, motion.source_on(body.fingerprint), other, progress)
     mf.save(out, motions["after"], body)
     excess = {k: m.pop("_excess") for k, m in measured.items()}
     pairs = [p.name for p in mf.shape.PAIRS]
@@ -293,7 +295,7 @@ def _measure_all(body, motions: dict, source, clip, reference, progress) -> dict
 
     pairs = mf.shape.PAIRS
     clearance = build_clearance(body, pairs)
-    limit, _ = reference_depths(clip, body, reference, pairs)
+    limit = reference_depths(clip, body, reference, pairs)
     # about 15 looks per second at the skin, between which a limb sinks in or out by some millimetres
     some = next(iter(motions.values()))
     step = max(1, round(some.frame_rate / 15))

@@ -10,7 +10,7 @@ import pytest
 import motionfit as mf
 from benchmarks.metrics import compilations
 from motionfit import samples
-from motionfit._motion import joint_angles
+from motionfit._motion import joint_angles, resample
 from motionfit.adapt._clearance import build_clearance, support
 from motionfit.adapt._limbs import _own_sets, _stages
 from motionfit.metrics import derivative_ratio, skin_depths
@@ -45,10 +45,38 @@ def test_heavy_body_comes_clean_and_stays_itself(fitted, heavy, average):
     assert np.array_equal(np.asarray(fitted.motion.rotations)[:, still], np.asarray(fitted.base.rotations)[:, still])
 
 
-def test_adapting_again_changes_nearly_nothing(fitted, heavy, average):
-    again = mf.adapt(fitted.motion, heavy, reference=average)
+@pytest.mark.parametrize("ending", [None, ".glb", ".npz"])
+def test_adapting_again_changes_nearly_nothing(ending, fitted, heavy, average, tmp_path):
+    """The adapted clip, and its file, know what they were made from."""
+    adapted = fitted.motion
+    if ending is not None:
+        mf.save(tmp_path / f"adapted{ending}", adapted, heavy)
+        adapted = mf.load_motion(tmp_path / f"adapted{ending}")
+    again = mf.adapt(adapted, heavy, reference=average)
     assert joint_angles(again.motion, fitted.motion).max() < np.deg2rad(0.1)
     assert np.abs(np.asarray(again.motion.root) - np.asarray(fitted.motion.root)).max() < 1e-4
+
+
+def test_only_the_source_tells_an_adapted_clip_from_one_to_adapt(fitted, heavy, average):
+    """The reference that plays the adapted clip has its arms out and shows less overlap than in the source."""
+    forgetful = mf.adapt(fitted.motion[:], heavy, reference=average, blocks=("arms",))
+    assert joint_angles(forgetful.motion, fitted.motion).max() > np.deg2rad(2.0)
+
+
+def test_an_adapted_clip_remembers_its_source(fitted, heavy, average, tmp_path):
+    walk, adapted = samples.walk(cycles=2), fitted.motion
+    assert np.array_equal(adapted.source_on(heavy.fingerprint).rotations, walk.rotations)
+    # on another body it is a clip like any other, made for the body that it was adapted to
+    assert adapted.source_on(average.fingerprint) is adapted
+    assert walk.source_on(heavy.fingerprint) is walk and adapted[:10].source is None
+    mf.save(tmp_path / "adapted.glb", adapted, heavy)
+    back = mf.load_motion(tmp_path / "adapted.glb", start=0.5, end=1.5, fps=30.0)
+    source = back.source_on(heavy.fingerprint)
+    assert source.frame_count == back.frame_count == 31
+    expected = mf.onto(resample(walk[30:91], 30.0), heavy.skeleton)
+    assert joint_angles(source, expected).max() < np.deg2rad(0.01)
+    # the body in the file is the same one
+    assert mf.load_character(tmp_path / "adapted.glb").fingerprint == heavy.fingerprint
 
 
 def test_another_length_or_girth_compiles_nothing(fitted, heavy, average):

@@ -172,7 +172,7 @@ def test_forearms_point_where_they_did(heavy, average):
     assert before is not None and after is not None and after < 0.5 * before
     limit = np.maximum(arms.details["excess_after_m"], 0).max()
     pairs = tuple(p for p in mf.shape.PAIRS if p.name in arms.details["pairs"])
-    own, _ = mf.adapt.reference_depths(walk, heavy, average, pairs)
+    own = mf.adapt.reference_depths(walk, heavy, average, pairs)
     depths = mf.adapt.volume_depths(mf.adapt.build_clearance(heavy, pairs), fit.motion) - own
     keep = [k for k, p in enumerate(pairs) if not p.first.endswith("upper_arm")]
     assert depths[:, keep].max() <= max(limit, 0.01)

@@ -195,7 +195,8 @@ def test_both_feet_that_never_move_change_nothing(average):
 def test_single_precision_agrees(average):
     """A motion of JAX's own arrays, as a fit returns it: the rotations are still the very same object."""
     walk = samples.walk(cycles=2)
-    single = mf.Motion(walk.skeleton, *(jnp.asarray(x, jnp.float32) for x in (walk.root, walk.rotations, walk.dt)))
+    root, rotations, dt = (jnp.asarray(x, jnp.float32) for x in (walk.root, walk.rotations, walk.dt))
+    single = mf.Motion(walk.skeleton, root, rotations, dt)
     found, double = mf.remove_footskate(single, average), mf.remove_footskate(walk, average)
     assert found.motion.rotations is single.rotations and found.motion.root.dtype == np.float32
     np.testing.assert_allclose(found.motion.root, double.motion.root, atol=5e-5)

@@ -40,7 +40,7 @@ class Arm:
         self.character, self.base = character, mf.onto(clip, character.skeleton)
         pairs = tuple(p for p in pairs_of("arms") if p.first.startswith("left"))
         self.clearance = build_clearance(character, pairs)
-        self.own, _ = reference_depths(clip, character, reference, pairs)
+        self.own = reference_depths(clip, character, reference, pairs)
         self.excess = volume_depths(self.clearance, self.base) - self.own
 
     def solve(self, basis: Basis) -> dict:

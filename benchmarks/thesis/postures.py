@@ -92,7 +92,7 @@ def postures(
 ) -> list[Posture]:
     """Postures in some frames, with their times under them where there is no `label`."""
     at = np.asarray(frames)
-    limit, _ = reference_depths(clip[at], character, stage.reference, PAIRS)
+    limit = reference_depths(clip[at], character, stage.reference, PAIRS)
     excess = volume_depths(build_clearance(character, PAIRS), motion[at]) - limit
     return [Posture(character, motion, int(f), e, label or f"{f * float(motion.dt):.2f} s")
             for f, e in zip(at, excess, strict=True)]  # fmt: skip

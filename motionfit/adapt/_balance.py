@@ -213,7 +213,7 @@ def _jerk(motion: Motion) -> float:
 def _sinking(clip: Motion, character: Character, reference: Character | None, so_far: Motion, at: Sampling):
     """Says of a motion whether some pair shows nearly as much as the tolerance, and more than before the block."""
     clearance = build_clearance(character, PAIRS)
-    limit, _ = reference_depths(clip[at.frames], character, reference, PAIRS)
+    limit = reference_depths(clip[at.frames], character, reference, PAIRS)
     before = volume_depths(clearance, at.motion(so_far)) - limit
 
     def sinks(motion: Motion) -> bool:

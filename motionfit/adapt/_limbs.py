@@ -48,7 +48,7 @@ WIDE = np.deg2rad(45.0)  # a turn that makes one look for a shorter way out
 # out, out and across: where an arm lies deep in a trunk or before it, each way out has a valley of its own
 STARTS = tuple(np.deg2rad(s) for s in ((30.0, 0.0, 0.0), (30.0, 30.0, 30.0), (30.0, -30.0, -30.0)))
 ROUNDS, PATIENCE = 9, 2  # rounds at most, and rounds without a better result
-FEW_FAULTS = 0.01
+FEW_FAULTS = 0.005
 CLOSER = (0, 1)  # rounds after which more frames are looked at
 
 
@@ -64,8 +64,8 @@ class Stage(NamedTuple):
 
 
 class Iterate(NamedTuple):
-    """A round's result; `faults` say how good it is: what is left and what is foreseen, in tolerances in the mean over
-    the frames, and jerk over the limit, a tenth of which counts as much as one."""
+    """A round's result; `faults` say how good it is: what is left, in tolerances in the mean over the frames, and jerk
+    over the limit, a fifth of which counts as much as one."""
 
     faults: float
     correction: Correction
@@ -94,6 +94,7 @@ def limbs(
     objective: str = "vertex",
     sweeps: int = 1,
     start: Fit | None = None,
+    source: Motion | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Fit:
     """Take the arms out of the trunk and the thighs, and the legs out of each other.
@@ -107,31 +108,28 @@ def limbs(
     `fit.details` holds per pair and seen frame (`["frames"]`) the excess depth [m] on the volumes before and after
     (`["excess_before_m"]`, `["excess_after_m"]`), and how much less than at first the fields were allowed in the end
     (`["held_back_m"]`). `blocks` are run in the order given, `sweeps` times, starting from zero or from the
-    result of an earlier `start` for the same clip.
+    result of an earlier `start` for the same clip. The reference plays the `source`, where the clip is adapted already.
     """
     base = onto(clip, character.skeleton)
     controls, whole, seen = _controls(character, base, blocks)
     everything = build_clearance(character, pairs_of(*blocks), objective)
     pairs, small = everything.pairs, seen.motion
 
-    own, joint_own = reference_depths(clip[seen.frames], character, reference, pairs, objective)
+    source = (source or clip)[seen.frames]
+    own = reference_depths(source, character, reference, pairs, objective)
     before = volume_depths(everything, small)
     excess = before - own
     # a pair that shows no violation is left alone; near the shoulder the skin alone knows
     slack = np.where([p.first.endswith("upper_arm") for p in pairs], np.inf, 1.0)
     looks = None
     if reference is None or objective != "vertex":
-        quiet = (before - np.maximum(own, joint_own)).max(axis=0) <= TOLERANCE
+        quiet = excess.max(axis=0) <= TOLERANCE
     else:
-        looks = SkinLooks(clip[seen.frames], character, reference, pairs)
+        looks = SkinLooks(source, character, reference, pairs)
         looks.look_closer(excess.max(axis=1))
-        on_skin = looks.depths(small)
-        quiet = (before - np.maximum(own, joint_own)).max(axis=0) <= slack * TOLERANCE
-        quiet &= looks.quiet(on_skin, small)
+        quiet = excess.max(axis=0) <= slack * TOLERANCE
+        quiet &= looks.quiet(looks.depths(small))
     kept = own + allowance(excess, ALLOWED_EXCESS, MARGIN)
-    # parts that do not meet at a joint touch less on the reference once the clip is adapted: what is kept must pass
-    # for no violation then either, and is still a touch
-    kept = np.where([p.adjacent for p in pairs], kept, np.minimum(kept, ENOUGH * TOLERANCE))
     if start is not None:
         _check_start(start, seen, pairs)
     allowed = np.where(quiet, np.maximum(before, own), kept)
@@ -164,34 +162,31 @@ def limbs(
         used = np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
         after = volume_depths(everything, moved)
         if looks is None:
-            over = left = np.where(quiet, 0.0, after - own)
+            left = np.where(quiet, 0.0, after - own)
         else:
             if round_ in CLOSER:
                 looks.look_closer((after - own).max(axis=1))
             on_skin = looks.depths_and_touches(moved)
             # what the first looks missed
-            woken = quiet & ~looks.quiet(on_skin, moved)
+            woken = quiet & ~looks.quiet(on_skin)
             quiet = quiet & ~woken
             stages = [_wake(s, woken[s.columns], kept[:, s.columns]) for s in stages]
             left = looks.joined(after - own, on_skin - looks.own, quiet)
-            if left.max() <= NEARLY * TOLERANCE:
-                looks.foresee(moved)
-            over = looks.joined(after - own, on_skin - looks.basis, quiet)
         jerk = derivative_ratio(_final(controls, whole, correction).apply(base), base, 3) or 1.0
-        faults = max(jerk - MOST_JERK, 0.0) / 0.1 + (_amount(left) + _amount(over)) / TOLERANCE
+        faults = max(jerk - MOST_JERK, 0.0) / 0.2 + _amount(left) / TOLERANCE
         # one that was looked at in fewer frames cannot be compared
         if faults < best.faults or round_ in CLOSER:
             best, since = Iterate(faults, correction, result.problem, after, allowed - used, left.max(initial=0.0)), 0
         since += 1
-        done = faults < FEW_FAULTS and over.max(initial=0.0) <= NEARLY * TOLERANCE
+        done = faults < FEW_FAULTS and left.max(initial=0.0) <= NEARLY * TOLERANCE
         if (done and round_ >= CLOSER[-1]) or since > PATIENCE:
             break
         if jerk > MOST_JERK:
             smooth *= 0.5
             correction = _calmed(correction)
-        if over.max() > ENOUGH * TOLERANCE:
+        if left.max() > ENOUGH * TOLERANCE:
             # the solver sees some probes only, and its corrections are smooth: what they left is taken off
-            more = np.where(over > ENOUGH * TOLERANCE, after - used, 0.0)
+            more = np.where(left > ENOUGH * TOLERANCE, after - used, 0.0)
             stages = [_tighten(s, more[:, s.columns], float(small.dt)) for s in stages]
     if looks is not None and best.left > TOLERANCE:
         best = best._replace(correction=_unless_worse(best.correction, looks, stages, base, seen, controls, whole))

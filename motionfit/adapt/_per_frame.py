@@ -34,7 +34,7 @@ def per_frame_ik(clip: Motion, character: Character, *, reference: Character | N
     base = onto(clip, character.skeleton)
     basis, pairs = per_frame(base.frame_count), pairs_of("arms", "legs")
     clearance = build_clearance(character, pairs)
-    own, _ = reference_depths(clip, character, reference, pairs)
+    own = reference_depths(clip, character, reference, pairs)
     controls = [c for c in arm_controls(character, base, basis) if c.name in ("left_arm", "right_arm")]
     controls.append(leg_controls(character, base, basis)[1])
     lever = np.array([_lever(character.skeleton, p) for p in pairs])

@@ -1,12 +1,13 @@
 """`adapt`: a clip and a character in, an adapted clip out. The whole procedure of thesis 5.2, block after block."""
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 
 from motionfit._character import Character
 from motionfit._control import Correction
 from motionfit._fit import Fit
-from motionfit._motion import Motion
+from motionfit._motion import Motion, Source
 from motionfit._onto import onto
 from motionfit._problem import Problem
 from motionfit._programs import make_room
@@ -47,7 +48,8 @@ def adapt(
     `balance` keeps the zero-moment point as near to the support as it was. Each has options of its own as
     `motionfit.adapt.forearm` and so on, which go on from a `Fit`. Penetration counts as far as it exceeds what the same
     clip shows on `reference`, the body that it was made for; without one, on the character before `girth`, else in
-    its rest pose.
+    its rest pose. A clip that was adapted to the same character before (`Motion.source`) is judged by what its source
+    shows there, and what was adapted well comes back as it is.
 
     `start` is an earlier fit of the same clip, to a body that is alike: the solver starts from its correction.
 
@@ -57,9 +59,13 @@ def adapt(
     unknown = [b for b in blocks if b not in BLOCKS]
     if unknown or not blocks:
         raise InputError(f"unknown block {', '.join(map(repr, unknown)) or 'list'}; blocks: {', '.join(BLOCKS)}")
+    if clip.frame_count == 0:
+        raise InputError("the clip has no frames: it was cut to nothing; check its start and end")
     make_room()
     if girth:
         reference, character = reference or character, grow(character, girth)
+    body = character.fingerprint
+    source, clip = (dataclasses.replace(m, source=None) for m in (clip.source_on(body), clip))
     base = onto(clip, character.skeleton)
     first, later = (tuple(b for b in some if b in blocks) for some in (LIMBS, LATER))
     parts = bool(first) + len(later)
@@ -70,15 +76,15 @@ def adapt(
 
     if first:
         fit = limbs(clip, character, reference=reference, blocks=first, objective=objective, sweeps=sweeps,
-                    start=start, progress=functools.partial(told, 0))  # fmt: skip
+                    start=start, source=source, progress=functools.partial(told, 0))  # fmt: skip
     else:
         fit = Fit(Correction((), ()), base, base, "converged", (), Problem(character, base, {}, ()))
     # what the source drifts is its own, unless nothing else is asked for
     options = {"footskate": {"drift": tuple(blocks) == ("footskate",)}}
     for k, name in enumerate(later, start=bool(first)):
-        fit = LATER[name](clip, character, fit, reference=reference, **options.get(name, {}))
+        fit = LATER[name](source, character, fit, reference=reference, **options.get(name, {}))
         told(k, name, 1, 1)
-    return fit
+    return dataclasses.replace(fit, motion=dataclasses.replace(fit.motion, source=Source(source, body)))
 
 
 def arms(clip: Motion, character: Character, **options) -> Fit:

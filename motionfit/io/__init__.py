@@ -1,5 +1,6 @@
 """Files in and out: metres, y up and quaternions wxyz on this side of the door."""
 
+import dataclasses
 import os
 import pathlib
 from collections.abc import Mapping
@@ -7,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from motionfit._character import Character
-from motionfit._motion import Motion, bind_pose, resample
+from motionfit._motion import Motion, Source, bind_pose, resample
 from motionfit._skeleton import load_role_mapping
 from motionfit._types import InputError
 from motionfit.io.bvh import parse_bvh, read_bvh, write_bvh
@@ -59,7 +60,11 @@ def trim(
     fps: float | None = None,
     name: str = "clip",
 ) -> Motion:
-    """The clip from `start` to `end` [s] at `fps` [1/s]; `name` is what errors call it."""
+    """The clip from `start` to `end` [s] at `fps` [1/s], and its source alike; `name` is what errors call it."""
+    if motion.source is not None and (start, end, fps) != (None, None, None):
+        source = trim(motion.source.motion, start=start, end=end, fps=fps, name=name)
+        cut = trim(dataclasses.replace(motion, source=None), start=start, end=end, fps=fps, name=name)
+        return dataclasses.replace(cut, source=Source(source, motion.source.body))
     duration = (motion.frame_count - 1) * float(motion.dt)
     low, high = start or 0.0, duration if end is None else end
     if not 0 <= low <= high or low > duration:
@@ -88,7 +93,7 @@ def load_character(path: str | os.PathLike, *, roles: Roles = None) -> Character
 
 def save(path: str | os.PathLike, motion: Motion, character: Character | None = None) -> None:
     """Write a motion; the ending chooses the format. .glb and .gltf hold the skinned, animated character, .bvh and
-    .npz the motion. The file is complete or not there."""
+    .npz the motion. All but .bvh hold the source of an adapted clip too. The file is complete or not there."""
     ending = _ending(path, CLIPS, "an output")
     if ending in (".glb", ".gltf"):
         if character is None:

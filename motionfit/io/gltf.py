@@ -1,6 +1,7 @@
 """glTF 2.0, .glb and .gltf: skinned characters and animations, through pygltflib's schema."""
 
 import base64
+import dataclasses
 import os
 import pathlib
 import warnings
@@ -12,13 +13,16 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from motionfit._character import Character
-from motionfit._motion import Motion, bind_pose
+from motionfit._motion import Motion, Source, bind_pose
+from motionfit._onto import onto
 from motionfit._skeleton import Skeleton
 from motionfit._skinning import Skin, vertex_normals
 from motionfit._types import InputError
 from motionfit.io.bvh import split_rest_frame, unreadable, write_bytes
 
 COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
+SOURCE_OF = "motionfit_source_on"  # extras of an animation: the body that the first one was adapted to
+SINGLE = 1e-6  # what single precision leaves of zero in a product of matrices
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 
 
@@ -229,6 +233,8 @@ class _Rig:
             raise document.fail("an inverse bind matrix cannot be inverted")
         # the mesh's own placement does not count in glTF; the first joint tells where its coordinates lie
         place = default[self.nodes.index(self.skin_joints[0])] @ inverse[0]
+        if np.abs(place - np.eye(4)).max() < SINGLE:
+            place = np.eye(4)  # so that what was written is read back to the bit
         of_node = {n: place @ np.linalg.inv(m) for n, m in zip(self.skin_joints, inverse, strict=True)}
         world = []
         for k, node in enumerate(self.nodes):
@@ -353,12 +359,24 @@ def _weld(vertices, faces, joints, weights):
 
 
 def read_motion(path: str | os.PathLike, *, rest_frame: str = "auto", roles: Mapping[str, str] | None = None) -> Motion:
-    """The first animation of a glTF file, sampled at the rate of its keys, on its skin's skeleton."""
+    """The first animation of a glTF file, sampled at the rate of its keys, on its skin's skeleton.
+
+    One that `write_gltf` marked as what the first was adapted from becomes its source.
+    """
     document = _Document(path)
     rig = _Rig(document, roles)
     if not document.gltf.animations:
         raise document.fail("holds no animation; export it with its animation, or give a .bvh")
-    animation = document.gltf.animations[0]
+    motion = _sampled(document, rig, document.gltf.animations[0], rest_frame)
+    for animation in document.gltf.animations[1:]:
+        body = animation.extras.get(SOURCE_OF) if isinstance(animation.extras, dict) else None
+        source = None if body is None else _sampled(document, rig, animation, rest_frame)
+        if source is not None and source.frame_count == motion.frame_count:
+            motion = dataclasses.replace(motion, source=Source(source, str(body)))
+    return motion
+
+
+def _sampled(document: _Document, rig: _Rig, animation, rest_frame: str) -> Motion:
     tracks: dict[tuple[int, str], tuple] = {}
     keys = []
     for channel in animation.channels:
@@ -467,7 +485,10 @@ class _Writer:
 
 
 def write_gltf(path: str | os.PathLike, motion: Motion, character: Character) -> None:
-    """Write a skinned, animated character as .glb (or .gltf with the data inside), for the Khronos validator."""
+    """Write a skinned, animated character as .glb (or .gltf with the data inside), for the Khronos validator.
+
+    The source of an adapted clip is a second animation.
+    """
     import json
     from importlib.metadata import version
 
@@ -513,6 +534,10 @@ def write_gltf(path: str | os.PathLike, motion: Motion, character: Character) ->
             nodes[parent].setdefault("children", []).append(child)
     nodes.append({"name": character.name, "mesh": 0, "skin": 0})
 
+    animations = [_animation(writer, "motion", motion)]
+    if motion.source is not None:
+        source = _animation(writer, "source", onto(motion.source.motion, skeleton))
+        animations.append(source | {"extras": {SOURCE_OF: motion.source.body}})
     document: dict = {
         "asset": {"version": "2.0", "generator": f"motionfit {version('motionfit')}"},
         "scene": 0,
@@ -523,7 +548,7 @@ def write_gltf(path: str | os.PathLike, motion: Motion, character: Character) ->
                        "pbrMetallicRoughness": {"baseColorFactor": [0.76, 0.6, 0.51, 1.0], "metallicFactor": 0.0,
                                                 "roughnessFactor": 0.8}}],
         "skins": [{"joints": list(range(joints)), "inverseBindMatrices": inverse_bind, "skeleton": 0}],
-        "animations": [_animation(writer, motion)],
+        "animations": animations,
     }  # fmt: skip
     document["accessors"], document["bufferViews"] = writer.accessors, writer.views
     binary = pathlib.Path(path).suffix.lower() == ".glb"
@@ -550,7 +575,7 @@ def _influences(skin: Skin):
             yield joints[:, k : k + 4].astype(kind), weights[:, k : k + 4]
 
 
-def _animation(writer: _Writer, motion: Motion) -> dict:
+def _animation(writer: _Writer, name: str, motion: Motion) -> dict:
     frames = motion.frame_count
     times = (np.arange(frames) * float(motion.dt)).astype(np.float32).reshape(-1, 1)
     time = writer.add(times, "SCALAR", bounds=True)
@@ -572,7 +597,7 @@ def _animation(writer: _Writer, motion: Motion) -> dict:
         track(rotations[:, joint][:, [1, 2, 3, 0]], "VEC4", joint, "rotation")
         if motion.translations is not None and joint > 0:
             track(np.asarray(motion.translations, float)[:, joint], "VEC3", joint, "translation")
-    return {"name": "motion", "samplers": samplers, "channels": channels}
+    return {"name": name, "samplers": samplers, "channels": channels}
 
 
 def _pack(text: bytes, data: bytes) -> bytes:

@@ -1,5 +1,6 @@
 """motionfit's own lossless motion format: a NumPy archive with the skeleton and the motion."""
 
+import dataclasses
 import io
 import json
 import os
@@ -8,7 +9,8 @@ import zipfile
 
 import numpy as np
 
-from motionfit._motion import Motion
+from motionfit._motion import Motion, Source
+from motionfit._onto import onto
 from motionfit._skeleton import Skeleton
 from motionfit._types import InputError
 from motionfit.io.bvh import unreadable, write_bytes
@@ -17,12 +19,14 @@ KEYS = ("motionfit_motion", "offsets", "rest_rotations", "end_offsets", "root", 
 
 
 def write_npz(path: str | os.PathLike, motion: Motion) -> None:
-    """Write a motion without loss: what is read back has the same bits."""
+    """Write a motion without loss: what is read back has the same bits. The source of an adapted clip is written as it
+    is on the same skeleton."""
     skeleton = motion.skeleton
     described = {
         "names": skeleton.names, "parents": skeleton.parents, "end_parents": skeleton.end_parents,
         "channels": skeleton.channels, "file_unit": skeleton.file_unit,
         "roles": {role: skeleton.names[joint] for role, joint in skeleton.roles},
+        "source_on": None if motion.source is None else motion.source.body,
     }  # fmt: skip
     arrays = {
         "motionfit_motion": np.array(json.dumps(described)), "offsets": skeleton.offsets,
@@ -31,6 +35,11 @@ def write_npz(path: str | os.PathLike, motion: Motion) -> None:
     }  # fmt: skip
     if motion.translations is not None:
         arrays["translations"] = motion.translations
+    if motion.source is not None:
+        source = onto(motion.source.motion, skeleton)
+        arrays |= {"source_root": source.root, "source_rotations": source.rotations}
+        if source.translations is not None:
+            arrays["source_translations"] = source.translations
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **{k: np.asarray(v) for k, v in arrays.items()})  # pyright: ignore[reportArgumentType]: NumPy's stub
     write_bytes(path, buffer.getvalue())
@@ -55,4 +64,8 @@ def read_npz(path: str | os.PathLike) -> Motion:
         d["names"], d["parents"], arrays["offsets"], arrays["rest_rotations"], roles=d["roles"],
         end_parents=d["end_parents"], end_offsets=arrays["end_offsets"], channels=channels, file_unit=d["file_unit"],
     )  # fmt: skip
-    return Motion(skeleton, arrays["root"], arrays["rotations"], arrays["dt"], arrays.get("translations"))
+    motion = Motion(skeleton, arrays["root"], arrays["rotations"], arrays["dt"], arrays.get("translations"))
+    if "source_root" not in arrays:
+        return motion
+    source = (arrays["source_root"], arrays["source_rotations"], arrays["dt"], arrays.get("source_translations"))
+    return dataclasses.replace(motion, source=Source(Motion(skeleton, *source), d["source_on"]))

@@ -278,9 +278,9 @@ def _lookup_jvp(primals, tangents):
 # --- making them ------------------------------------------------------------------------------------------------
 
 
-def standing(skeleton: Skeleton, swing: float = 0.0, out: float = 0.035) -> Motion:
-    """One frame of standing with the arms hanging straight, `out` [rad] from the vertical to their side and `swing`
-    [rad] to the front, all else at bind."""
+def standing(skeleton: Skeleton, out: float = 0.035) -> Motion:
+    """One frame of standing with the arms hanging straight, `out` [rad] from the vertical to their side, all else at
+    bind."""
     rest = rest_motion(skeleton)
     positions, world = bind_pose(skeleton)
     rotations = np.array(rest.rotations, float)
@@ -291,7 +291,7 @@ def standing(skeleton: Skeleton, swing: float = 0.0, out: float = 0.035) -> Moti
             continue
         arm, elbow, hand = chain
         sign = np.sign(positions[arm][0] - positions[skeleton.joint("chest")][0])
-        down = np.array([sign * np.sin(out), -np.cos(out) * np.cos(swing), np.cos(out) * np.sin(swing)])
+        down = np.array([sign * np.sin(out), -np.cos(out), 0.0])
         for joint, end in ((arm, elbow), (elbow, hand)):
             bone = positions[end] - positions[joint]
             laid, _ = Rotation.align_vectors(down[None], (bone / np.linalg.norm(bone))[None])  # pyright: ignore[reportAssignmentType]
