@@ -22,13 +22,13 @@ class Sole(NamedTuple):
     """Sole vertices of both feet, and what moves them.
 
     `vertices` are indices into the character's mesh and `side` says whose they are (0 left, 1 right). Each of the
-    `bones` carries some: it names a joint, the rows of `vertices` that it moves, their positions in that joint's
-    frame [m] and their skin weights.
+    `joints` has four rows in `carried`: where the vertices are in its frame [m] times their skin weight, and the weight.
     """
 
     vertices: Int[np.ndarray, " soles"]
     side: Int[np.ndarray, " soles"]
-    bones: tuple[tuple[int, np.ndarray, np.ndarray, np.ndarray], ...]
+    joints: tuple[int, ...]
+    carried: Float[np.ndarray, "rows soles"]
     skeleton: Skeleton
 
     def of(self, foot: int) -> Int[np.ndarray, " soles_of_foot"]:
@@ -82,7 +82,7 @@ def _find_sole(character: Character, cells: int | None, include: tuple[int, ...]
         chosen.append(np.union1d(thin, np.intersect1d(mine, np.array(include, int))))
         side.append(np.full(len(chosen[-1]), foot))
     picked = np.concatenate(chosen)
-    return Sole(picked, np.concatenate(side), _bones(character, picked), skeleton)
+    return Sole(picked, np.concatenate(side), *_carried(character, picked), skeleton)
 
 
 def _facing_down(vertices: np.ndarray, faces: np.ndarray, mine: np.ndarray) -> np.ndarray:
@@ -109,19 +109,19 @@ def _lowest_per_cell(vertices: np.ndarray, low: np.ndarray, cells: int) -> np.nd
     return np.sort(low[order[first]])
 
 
-def _bones(character: Character, picked: np.ndarray) -> tuple:
+def _carried(character: Character, picked: np.ndarray) -> tuple[tuple[int, ...], Float[np.ndarray, "rows soles"]]:
+    """The joints that move the picked vertices, and `Sole.carried`."""
     positions, rotations = bind_pose(character.skeleton)
     joints = np.asarray(character.skin.joints)[picked]
     weights = np.asarray(character.skin.weights, float)[picked]
     weights = weights / weights.sum(1, keepdims=True)
     bind = np.asarray(character.skin.vertices_bind, float)[picked]
-    bones = []
-    for joint in np.unique(joints[weights > 0]):
+    found, rows = np.unique(joints[weights > 0]).tolist(), []
+    for joint in found:
         weight = np.where(joints == joint, weights, 0.0).sum(1)
-        rows = np.flatnonzero(weight > 0)
-        local = (bind[rows] - positions[joint]) @ _matrix(rotations[joint])
-        bones.append((int(joint), rows, local, weight[rows]))
-    return tuple(bones)
+        local = (bind - positions[joint]) @ _matrix(rotations[joint])
+        rows += [*(weight * local.T), weight]
+    return tuple(found), np.array(rows)
 
 
 def _matrix(q: Float[np.ndarray, "... 4"]) -> Float[np.ndarray, "... 3 3"]:
@@ -164,14 +164,14 @@ def chain_kinematics(
 
 
 def sole_paths(sole: Sole, motion: Motion) -> Float[np.ndarray, "frames soles 3"]:
-    """World position [m] of every sole vertex in every frame: linear blend skinning, thesis (4.20)."""
-    world = chain_kinematics(motion, tuple(b[0] for b in sole.bones))
-    paths = np.zeros((motion.frame_count, len(sole.vertices), 3))
-    for joint, rows, local, weight in sole.bones:
-        turn, place = world[joint]
-        moved = np.matmul(local, np.swapaxes(turn, 1, 2)) + place[:, None]
-        paths[:, rows] += weight[:, None] * moved
-    return paths
+    """World position [m] of every sole vertex in every frame: linear blend skinning, thesis (4.20), as one product of
+    all joints' [turn | place] with what they carry."""
+    world, frames = chain_kinematics(motion, sole.joints), motion.frame_count
+    poses = np.empty((frames, 3, len(sole.joints), 4))
+    for k, joint in enumerate(sole.joints):
+        poses[:, :, k, :3], poses[:, :, k, 3] = world[joint]
+    paths = poses.reshape(3 * frames, -1) @ sole.carried
+    return np.ascontiguousarray(np.swapaxes(paths.reshape(frames, 3, -1), 1, 2))
 
 
 def rows_of(sole: Sole, vertex: Int[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
