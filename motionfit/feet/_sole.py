@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from motionfit._character import PARTS, Character
-from motionfit._motion import Motion, bind_pose
+from motionfit._motion import Motion, bind_pose, host_matrices
 from motionfit._skeleton import SIDES, Skeleton
 from motionfit._types import InputError
 
@@ -119,19 +119,9 @@ def _carried(character: Character, picked: np.ndarray) -> tuple[tuple[int, ...],
     found, rows = np.unique(joints[weights > 0]).tolist(), []
     for joint in found:
         weight = np.where(joints == joint, weights, 0.0).sum(1)
-        local = (bind - positions[joint]) @ _matrix(rotations[joint])
+        local = (bind - positions[joint]) @ host_matrices(rotations[joint])
         rows += [*(weight * local.T), weight]
     return tuple(found), np.array(rows)
-
-
-def _matrix(q: Float[np.ndarray, "... 4"]) -> Float[np.ndarray, "... 3 3"]:
-    """Rotation matrices of unit quaternions wxyz, on the host."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    m = np.empty((*q.shape[:-1], 3, 3))
-    m[..., 0, 0], m[..., 0, 1], m[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    m[..., 1, 0], m[..., 1, 1], m[..., 1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    m[..., 2, 0], m[..., 2, 1], m[..., 2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-    return m
 
 
 def chain_kinematics(
@@ -149,7 +139,7 @@ def chain_kinematics(
             joint = parents[joint]
     offsets = np.asarray(motion.skeleton.offsets, float)
     order = sorted(needed)
-    local = _matrix(np.asarray(motion.rotations)[:, order].astype(float))
+    local = host_matrices(np.asarray(motion.rotations)[:, order].astype(float))
     world: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     for k, joint in enumerate(order):
         parent = parents[joint]
