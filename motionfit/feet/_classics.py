@@ -23,8 +23,8 @@ def foot_joints(skeleton: Skeleton) -> list[tuple[int, ...]]:
 def leg_joints(skeleton: Skeleton) -> list[tuple[int, int, int]]:
     """Hip, knee and ankle joint of each leg."""
     if "leg_joints" not in skeleton.memo:
-        roles = ("thigh", "calf", "foot")
-        skeleton.memo["leg_joints"] = [tuple(skeleton.joint(f"{side}_{role}") for role in roles) for side in SIDES]
+        joint = skeleton.joint
+        skeleton.memo["leg_joints"] = [(joint(f"{s}_thigh"), joint(f"{s}_calf"), joint(f"{s}_foot")) for s in SIDES]
     return skeleton.memo["leg_joints"]
 
 

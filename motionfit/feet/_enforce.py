@@ -297,9 +297,9 @@ def _turn_leg(
         values[busy, 3] = np.einsum("fa,fa->f", knee, some.knee_axis)
         values[busy] = prioritized(chain_tasks(some, [p[busy] for p in paths]), values[busy], lower=lower[busy],
                                    upper=upper[busy], tolerance=1e-2 * REACHED)  # fmt: skip
-        turns = [Rotation.from_matrix(turn) for turn in chain_pose(some, values[busy]).turns]
-        if len(joints) < 2:
-            turns[2] = None  # without a toe nothing says how the foot should turn: it keeps its way
+        thigh, shank, foot = (Rotation.from_matrix(turn) for turn in chain_pose(some, values[busy]).turns)
+        # without a toe nothing says how the foot should turn: it keeps its way
+        turns = thigh, shank, foot if len(joints) == 2 else None
         turned = turned_locals(base.skeleton, rotations[busy], local[busy], leg.joints, turns)
         for joint, quaternion in zip(leg.joints, turned, strict=True):
             local[busy, joint] = quaternion
