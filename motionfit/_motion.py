@@ -297,25 +297,49 @@ def host_kinematics(
 ) -> tuple[Float[np.ndarray, "frames joints 3"], Float[np.ndarray, "frames joints 4"]]:
     """World positions [m] and rotations in double precision whatever JAX's mode is, without compiling anything:
     for files, set-up and measures. Of all joints, or of `joints` and those above them: the others are NaN then."""
-    skeleton, rotations = motion.skeleton, np.asarray(motion.rotations, float)
-    offsets = np.asarray(skeleton.offsets, float)
-    positions, world = np.full((*rotations.shape[:2], 3), np.nan), np.full_like(rotations, np.nan)
-    needed = np.ones(len(skeleton.parents), bool)
-    if joints is not None:
-        needed = _ancestors(tuple(skeleton.parents))[list(joints)].any(0)
-    turned: dict[int, Rotation] = {}
-    for joint in np.flatnonzero(needed).tolist():
-        parent = skeleton.parents[joint]
-        turn = Rotation.from_quat(rotations[:, joint], scalar_first=True)
-        if parent < 0:
-            positions[:, joint] = np.asarray(motion.root, float)
-        else:
-            offset = offsets[joint] if motion.translations is None else np.asarray(motion.translations, float)[:, joint]
-            positions[:, joint] = positions[:, parent] + turned[parent].apply(offset)
-            turn = turned[parent] * turn
-        turned[joint] = turn
-        world[:, joint] = turn.as_quat(scalar_first=True)
+    skeleton, parents = motion.skeleton, np.array(motion.skeleton.parents)
+    needed = {0}
+    for joint in range(len(parents)) if joints is None else joints:
+        while joint not in needed:
+            needed.add(joint)
+            joint = skeleton.parents[joint]
+    some = sorted(needed)
+    local = np.asarray(motion.rotations)[:, some].astype(float)
+    local /= np.linalg.norm(local, axis=-1, keepdims=True)
+    offsets = np.asarray(skeleton.offsets, float)[some, :, None]
+    if motion.translations is not None:
+        offsets = np.asarray(motion.translations, float)[:, some, :, None]
+    world, positions = (np.full((motion.frame_count, len(parents), k), np.nan) for k in (4, 3))
+    world[:, some], positions[:, 0] = local, np.asarray(motion.root, float)
+    below = [own for level in skeleton.levels[1:] if (own := [j for j in level if j in needed])]
+    for own in below:
+        world[:, own] = host_product(world[:, parents[own]], world[:, own])
+    bones = np.empty_like(positions)
+    bones[:, some] = (host_matrices(world[:, parents[some]]) @ offsets)[..., 0]
+    for own in below:
+        positions[:, own] = positions[:, parents[own]] + bones[:, own]
     return positions, world
+
+
+CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])  # times a unit quaternion: its inverse
+# p q = (signed p in the order of this table) times q
+_LEFT = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
+_SIGNS = np.array([[1.0, -1, -1, -1], [1, 1, -1, 1], [1, 1, 1, -1], [1, -1, 1, 1]])
+
+
+def host_product(p: Float[np.ndarray, "... 4"], q: Float[np.ndarray, "... 4"]) -> Float[np.ndarray, "... 4"]:
+    """Products of quaternions, on the host: a tenth of SciPy's time for a hundred of them."""
+    return np.einsum("...ij,...j->...i", p[..., _LEFT] * _SIGNS, q)
+
+
+def host_matrices(q: Float[np.ndarray, "... 4"]) -> Float[np.ndarray, "... 3 3"]:
+    """Rotation matrices of unit quaternions, on the host."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    m = np.empty((*q.shape[:-1], 3, 3))
+    m[..., 0, 0], m[..., 0, 1], m[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    m[..., 1, 0], m[..., 1, 1], m[..., 1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    m[..., 2, 0], m[..., 2, 1], m[..., 2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    return m
 
 
 def bind_pose(skeleton: Skeleton) -> tuple[Float[np.ndarray, "joints 3"], Float[np.ndarray, "joints 4"]]:

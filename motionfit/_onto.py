@@ -23,6 +23,8 @@ def onto(motion: Motion, skeleton: Skeleton) -> Motion:
     A skeleton that is truly the same gets the motion back bit for bit.
     """
     source = motion.skeleton
+    if source is skeleton:
+        return motion
     if source.is_same(skeleton):
         return Motion(skeleton, motion.root, motion.rotations, motion.dt, motion.translations)
     required = ("hips", *(f"{s}_{r}" for s in SIDES for r in ("thigh", "calf", "foot", "upper_arm", "forearm")))

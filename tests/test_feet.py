@@ -23,6 +23,7 @@ from motionfit.feet import (
     find_sole,
     fit_floor,
     frame_heights,
+    gather,
     horizontal_path,
     load_labels,
     place_at,
@@ -38,7 +39,7 @@ from motionfit.feet._plants import runs
 from motionfit.feet._root import SLOW, path_stretch
 from motionfit.feet._transfer import evaluate, integral
 from motionfit.metrics import posed_vertices
-from tests.helpers import jumping
+from tests.helpers import jumping, with_legs
 
 SAME = 1e-9  # [m] "unchanged" in double precision
 ROOT = 1e-5  # closed-form roots against numpy.roots: multiple roots keep a third of the digits in both
@@ -426,6 +427,16 @@ def test_a_missing_toe_joint_is_no_obstacle(average, method, frames):
 
 
 # --- labels ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("standing", [0.0, 10.0])
+def test_a_path_of_longer_legs_is_recognised_however_long_the_body_stands(average, standing):
+    """Two seconds of walking with the root path of other legs skate, whatever is around them."""
+    walk, body = samples.walk(cycles=2), with_legs(average, 0.7)
+    frames = np.append(np.zeros(round(standing / float(walk.dt)), int), np.arange(walk.frame_count))
+    skating = mf.Motion(body.skeleton, walk.root, walk.rotations, walk.dt)[frames]
+    assert gather(find_sole(body), skating).path_scale == pytest.approx(0.7, abs=0.05)
+    assert gather(find_sole(body), mf.onto(walk, body.skeleton)[frames]).path_scale == 1.0
 
 
 def test_labels_are_written_and_read_again(tmp_path):

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import trimesh
 from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import motionfit as mf
-from motionfit._motion import host_kinematics, joint_angles, rest_motion
+from motionfit._motion import CONJUGATE, host_kinematics, host_matrices, host_product, joint_angles, rest_motion
 from tests.helpers import matrices, motions, random_motion
 
 EXACT = 1e-10  # positions of a metre over a dozen joints in double precision
@@ -30,8 +31,17 @@ def test_forward_kinematics_agrees_with_matrix_products(arguments):
     some, turned = host_kinematics(motion, [len(motion.skeleton.names) - 1])
     there = np.isfinite(some[0, :, 0])
     assert there[[0, -1]].all()
-    np.testing.assert_array_equal(some[:, there], positions[:, there])
-    np.testing.assert_array_equal(turned[:, there], rotations[:, there])
+    np.testing.assert_allclose(some[:, there], positions[:, there], atol=EXACT)
+    np.testing.assert_allclose(turned[:, there], rotations[:, there], atol=EXACT)
+
+
+@given(st.integers(0, 2**31))
+def test_products_on_the_host_are_those_of_rotations(seed):
+    p, q = (Rotation.random(5, random_state=np.random.default_rng([seed, k])) for k in (0, 1))  # pyright: ignore[reportCallIssue]: the name before SciPy 1.15
+    product = host_product(p.as_quat(scalar_first=True), q.as_quat(scalar_first=True))
+    np.testing.assert_allclose(host_matrices(product), (p * q).as_matrix(), atol=EXACT)
+    np.testing.assert_allclose(host_product(CONJUGATE * p.as_quat(scalar_first=True), product),
+                               q.as_quat(scalar_first=True), atol=EXACT)  # fmt: skip
 
 
 @given(motions)

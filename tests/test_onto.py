@@ -21,6 +21,7 @@ def test_the_same_skeleton_gets_the_motion_back_bit_for_bit(average):
     walk = samples.walk(cycles=1)
     again = mf.onto(walk, average.skeleton)
     assert np.array_equal(again.rotations, walk.rotations) and np.array_equal(again.root, walk.root)
+    assert mf.onto(again, average.skeleton) is again
 
 
 def test_real_clip_on_a_pose_character_keeps_every_limb_direction(shared_data):

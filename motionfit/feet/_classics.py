@@ -11,11 +11,21 @@ from motionfit.feet._sole import Sole, chain_kinematics
 
 def foot_joints(skeleton: Skeleton) -> list[tuple[int, ...]]:
     """Ankle and, where there is one, toe joint of each foot."""
-    joints = []
-    for side in SIDES:
-        toe = skeleton.find(f"{side}_toe")
-        joints.append((skeleton.joint(f"{side}_foot"), *(() if toe is None else (toe,))))
-    return joints
+    if "foot_joints" not in skeleton.memo:
+        joints = []
+        for side in SIDES:
+            toe = skeleton.find(f"{side}_toe")
+            joints.append((skeleton.joint(f"{side}_foot"), *(() if toe is None else (toe,))))
+        skeleton.memo["foot_joints"] = joints
+    return skeleton.memo["foot_joints"]
+
+
+def leg_joints(skeleton: Skeleton) -> list[tuple[int, int, int]]:
+    """Hip, knee and ankle joint of each leg."""
+    if "leg_joints" not in skeleton.memo:
+        joint = skeleton.joint
+        skeleton.memo["leg_joints"] = [(joint(f"{s}_thigh"), joint(f"{s}_calf"), joint(f"{s}_foot")) for s in SIDES]
+    return skeleton.memo["leg_joints"]
 
 
 def fixed_thresholds(motion: Motion, *, height: float = 0.05, speed: float = 0.5) -> Bool[np.ndarray, "frames 2"]:

@@ -11,7 +11,7 @@ from motionfit.feet._classics import foot_joints
 from motionfit.feet._cycles import Constraint, find_constraints
 from motionfit.feet._floor import Floor
 from motionfit.feet._knees import calm_knees
-from motionfit.feet._leg import Leg, find_legs, leg_kinematics
+from motionfit.feet._leg import Leg, find_legs, leg_kinematics, turned_locals
 from motionfit.feet._plants import Footplants
 from motionfit.feet._sole import Sole, sole_paths
 from motionfit.ik import Task, move_limb, prioritized
@@ -78,45 +78,60 @@ class Chain(NamedTuple):
     ankle_axes: np.ndarray  # (frames, 2, 3)
 
 
-def chain_pose(
-    chain: Chain, values: np.ndarray
-) -> tuple[Rotation, Rotation, Rotation, np.ndarray, np.ndarray, np.ndarray]:
-    """Turns of thigh, shank and foot (rotation vectors from the clip's pose on), with knee, ankle and toe."""
-    upper = Rotation.from_rotvec(values[:, :3])
-    lower = upper * Rotation.from_rotvec(values[:, 3:4] * chain.knee_axis)
-    end = lower * Rotation.from_rotvec(np.einsum("fk,fka->fa", values[:, 4:6], chain.ankle_axes))
-    knee = chain.hip + upper.apply(chain.thigh)
-    ankle = knee + lower.apply(chain.shank)
-    return upper, lower, end, knee, ankle, ankle + end.apply(chain.foot)
+class Pose(NamedTuple):
+    """A chain at some values: how thigh, shank and foot are turned from the clip's pose on, where knee, ankle and
+    toe are [m], and how the turns of hip, knee and ankle change with their rotation vectors."""
+
+    turns: Float[np.ndarray, "3 batch 3 3"]
+    knee: Float[np.ndarray, "batch 3"]
+    ankle: Float[np.ndarray, "batch 3"]
+    toe: Float[np.ndarray, "batch 3"]
+    changes: Float[np.ndarray, "3 batch 3 3"]
 
 
-def _left_jacobian(vector: np.ndarray) -> np.ndarray:
-    """How the rotation of a rotation vector turns when the vector changes, in the frame it turns into."""
-    angle = np.linalg.norm(vector, axis=1)[:, None, None]
-    x, y, z = vector.T
-    zero = np.zeros_like(x)
-    cross = np.stack([np.stack(r, -1) for r in ((zero, -z, y), (z, zero, -x), (-y, x, zero))], 1)
-    small = angle < 1e-4
-    safe = np.where(small, 1.0, angle)
-    a = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
-    b = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
-    return np.eye(3) + a * cross + b * cross @ cross
+def chain_pose(chain: Chain, values: Float[np.ndarray, "batch 6"]) -> Pose:
+    """The chain's pose: three values are the hip's rotation vector, one bends the knee, two turn the ankle."""
+    ankle = np.einsum("fk,fka->fa", values[:, 4:6], chain.ankle_axes)
+    (upper, bend, end), changes = _exponential(np.stack([values[:, :3], values[:, 3:4] * chain.knee_axis, ankle]))
+    lower = upper @ bend
+    turns = np.stack([upper, lower, lower @ end])
+    bones = turns @ np.stack([chain.thigh, chain.shank, chain.foot])[..., None]
+    knee, ankle, toe = chain.hip + np.cumsum(bones[..., 0], axis=0)
+    return Pose(turns, knee, ankle, toe, changes)
+
+
+def _exponential(
+    vectors: Float[np.ndarray, "... 3"],
+) -> tuple[Float[np.ndarray, "... 3 3"], Float[np.ndarray, "... 3 3"]]:
+    """Rotation matrices of rotation vectors (Rodrigues), and how they turn, in the frame that they turn into, when the
+    vectors change."""
+    squared = np.einsum("...a,...a->...", vectors, vectors)[..., None, None]
+    small = squared < 1e-8
+    angle = np.sqrt(np.where(small, 1.0, squared))
+    first = np.where(small, 1.0 - squared / 6, np.sin(angle) / angle)
+    second = np.where(small, 0.5 - squared / 24, (1 - np.cos(angle)) / angle**2)
+    third = np.where(small, 1 / 6 - squared / 120, (angle - np.sin(angle)) / angle**3)
+    cross = np.zeros((*vectors.shape, 3))
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    cross[..., 2, 1], cross[..., 0, 2], cross[..., 1, 0] = x, y, z
+    cross = cross - np.swapaxes(cross, -1, -2)
+    twice = cross @ cross
+    return np.eye(3) + first * cross + second * twice, np.eye(3) + second * cross + third * twice
 
 
 def chain_effectors(
-    chain: Chain, values: np.ndarray
+    chain: Chain, values: Float[np.ndarray, "batch 6"]
 ) -> tuple[Float[np.ndarray, "effectors batch 3"], Float[np.ndarray, "effectors batch 3 6"]]:
     """Where ankle and toe are [m], and how the six values move them."""
-    upper, lower, _, knee, ankle, toe = chain_pose(chain, values)
-    points = np.stack([ankle, toe])
-    jacobians = np.zeros((2, len(values), 3, 6))
-    hips = np.swapaxes(_left_jacobian(values[:, :3]), 1, 2)  # rows: world axes of the three hip values
-    jacobians[..., :3] = np.swapaxes(np.cross(hips, (points - chain.hip)[:, :, None]), 2, 3)
-    jacobians[..., 3] = np.cross(upper.apply(chain.knee_axis), points - knee)
-    vector = np.einsum("fk,fka->fa", values[:, 4:6], chain.ankle_axes)
-    axes = np.einsum("fab,fkb->fka", _left_jacobian(vector), chain.ankle_axes)
-    for k in range(2):
-        jacobians[1, :, :, 4 + k] = np.cross(lower.apply(axes[:, k]), toe - ankle)
+    pose = chain_pose(chain, values)
+    upper, lower = pose.turns[:2]
+    points = np.stack([pose.ankle, pose.toe])
+    # world axes of the six values, in columns, each through its joint
+    axes = np.concatenate([pose.changes[0], upper @ chain.knee_axis[..., None],
+                           lower @ pose.changes[2] @ np.swapaxes(chain.ankle_axes, 1, 2)], axis=2)  # fmt: skip
+    joints = np.stack([chain.hip] * 3 + [pose.knee] + [pose.ankle] * 2, axis=2)
+    jacobians = np.cross(axes, points[..., None] - joints, axis=-2)
+    jacobians[0, ..., 4:] = 0.0  # the ankle is not moved by its own turns
     return points, jacobians
 
 
@@ -258,7 +273,6 @@ def _turn_leg(
     paths: list[np.ndarray], local: np.ndarray,
 ) -> list[Float[np.ndarray, " frames"]]:  # fmt: skip
     """Bring a leg's effectors to their paths; writes joint rotations into `local`, returns the errors left [m]."""
-    thigh, calf, ankle = leg.joints
     foot = positions[:, joints[1]] - leg.ankle if len(joints) == 2 else np.zeros_like(leg.ankle)
     forward = foot / np.maximum(np.linalg.norm(foot, axis=1, keepdims=True), 1e-9)
     side = leg.lateral - np.einsum("fa,fa->f", leg.lateral, forward)[:, None] * forward
@@ -271,10 +285,9 @@ def _turn_leg(
     upper = -lower
     # a knee that the clip has bent further, or the other way, may stay so
     lower[:, 3], upper[:, 3] = np.minimum(KNEE[0] - bent, 0.0), np.maximum(KNEE[1] - bent, 0.0)
-    tasks = chain_tasks(chain, paths)
     values = np.zeros((len(bent), 6))
     # frames in which every effector already is where it should be are left alone, bit for bit
-    busy = np.max([np.abs(task(values)[0]).max(1) for task in tasks], axis=0) > 1e-12
+    busy = np.max([np.abs(path - positions[:, j]).max(1) for path, j in zip(paths, joints, strict=True)], 0) > 1e-12
     if busy.any():
         some = Chain(*(x[busy] for x in chain))
         # the analytic leg is the start: from a straight knee no gradient says which way to bend
@@ -284,17 +297,11 @@ def _turn_leg(
         values[busy, 3] = np.einsum("fa,fa->f", knee, some.knee_axis)
         values[busy] = prioritized(chain_tasks(some, [p[busy] for p in paths]), values[busy], lower=lower[busy],
                                    upper=upper[busy], tolerance=1e-2 * REACHED)  # fmt: skip
-        turns = chain_pose(some, values[busy])[:3]
-        worlds = {j: Rotation.from_quat(rotations[busy, j], scalar_first=True)
-                  for j in (base.skeleton.parents[thigh], thigh, base.skeleton.parents[calf], calf,
-                            base.skeleton.parents[ankle], ankle) if j >= 0}  # fmt: skip
-        above = Rotation.identity(int(busy.sum()))
-        for joint, turn in zip(leg.joints, turns, strict=True):
-            # without a toe nothing says how the foot should turn: it keeps its way
-            turn = turn if len(joints) == 2 or joint != ankle else Rotation.identity(int(busy.sum()))
-            parent = base.skeleton.parents[joint]
-            quaternion = ((above * worlds[parent]).inv() * turn * worlds[joint]).as_quat(scalar_first=True)
-            quaternion *= np.where((quaternion * local[busy, joint]).sum(1, keepdims=True) < 0, -1.0, 1.0)
+        thigh, shank, foot = (Rotation.from_matrix(turn) for turn in chain_pose(some, values[busy]).turns)
+        # without a toe nothing says how the foot should turn: it keeps its way
+        turns = thigh, shank, foot if len(joints) == 2 else None
+        turned = turned_locals(base.skeleton, rotations[busy], local[busy], leg.joints, turns)
+        for joint, quaternion in zip(leg.joints, turned, strict=True):
             local[busy, joint] = quaternion
-            above = turn
-    return [np.linalg.norm(task(values)[0], axis=1) for task in tasks]
+    pose = chain_pose(chain, values)
+    return [np.linalg.norm(path - end, axis=1) for path, end in zip(paths, (pose.ankle, pose.toe), strict=False)]

@@ -54,7 +54,7 @@ def fit_floor(
     share = np.cumsum(weights[order]) / weights.sum()
     height = float(heights[order[np.searchsorted(share, 1 / 3)]])
     # the slope's own origin: amid the points, so that the prior on the slopes does not depend on where they are
-    centre = np.average(points_world[:, [0, 2]], axis=0, weights=weights)
+    centre = weights @ points_world[:, [0, 2]] / weights.sum()
     across = points_world[:, [0, 2]] - centre
     design = np.column_stack([np.ones(len(heights)), across])
     prior = np.diag([0.0, 1.0, 1.0]) * (NOISE / TILT_PRIOR) ** 2
@@ -62,12 +62,11 @@ def fit_floor(
     # wide at first, since a tilted floor leaves large residuals to a level start
     for width in (4, 3, 2, 1.5, 1, 1, 1, 1):
         residual = heights - design @ plane
-        robust = weights * np.clip(1 - (residual / (width * OUTLIER)) ** 2, 0.0, 1.0) ** 2
-        if robust.sum() <= 0:
+        robust = weights * np.maximum(1 - (residual / (width * OUTLIER)) ** 2, 0.0) ** 2
+        total = robust.sum()
+        if total <= 0:
             break
-        share = STEPS * robust / robust.sum()
-        normal = design.T @ (share[:, None] * design)
+        shared = (STEPS / total * robust) * design.T
         # residuals against the current plane keep an exact fit exact
-        step = np.linalg.solve(normal + prior, design.T @ (share * residual) - prior @ plane)
-        plane = plane + step
+        plane = plane + np.linalg.solve(shared @ design + prior, shared @ residual - prior @ plane)
     return Floor(float(plane[0] - plane[1:] @ centre), float(plane[1]), float(plane[2]))

@@ -7,6 +7,7 @@ passes over smoothly from one to the next.
 """
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,9 +17,9 @@ from scipy.sparse import csr_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
-from motionfit._motion import Motion, bind_pose, host_kinematics
-from motionfit._skeleton import SIDES, Skeleton
-from motionfit.feet._classics import foot_joints
+from motionfit._motion import CONJUGATE, Motion, bind_pose, host_kinematics, host_product
+from motionfit._skeleton import Skeleton
+from motionfit.feet._classics import foot_joints, leg_joints
 from motionfit.feet._detect import smooth
 from motionfit.feet._floor import Floor
 from motionfit.feet._knees import calm_knees
@@ -88,8 +89,7 @@ def find_legs(skeleton: Skeleton, positions: np.ndarray, rotations: np.ndarray) 
     """Both legs of a motion whose world kinematics are given. The knee's axis is the one about which the shank bends
     over the clip, fixed in the thigh; a leg that never bends takes the character's left-right axis at bind."""
     legs = []
-    for side in SIDES:
-        joints = skeleton.joint(f"{side}_thigh"), skeleton.joint(f"{side}_calf"), skeleton.joint(f"{side}_foot")
+    for joints in leg_joints(skeleton):
         hip, knee, ankle = (positions[:, j] for j in joints)
         turn = Rotation.from_quat(rotations[:, joints[0]], scalar_first=True)
         bend = turn.inv().apply(np.cross(knee - hip, ankle - knee)).sum(0)
@@ -221,26 +221,38 @@ def turn_legs(
     skeleton, local = motion.skeleton, np.array(motion.rotations, float)
     reachable = np.ones((motion.frame_count, 2), bool)
 
-    def world(joint: int) -> Rotation:
-        return Rotation.from_quat(rotations[:, joint], scalar_first=True)
-
     for side, (leg, target) in enumerate(zip(legs, targets, strict=True)):
         found = move_limb(leg.hip, leg.knee, leg.ankle, target, leg.lateral)
         reachable[:, side] = found.reachable
         moved = np.linalg.norm(target - leg.ankle, axis=1) > 0
-        thigh, calf, foot = leg.joints
-        # joints between (twist bones) turn with the one above them
-        new = {
-            thigh: world(skeleton.parents[thigh]).inv() * found.upper * world(thigh),
-            calf: (found.upper * world(skeleton.parents[calf])).inv() * found.lower * world(calf),
-            foot: (found.lower * world(skeleton.parents[foot])).inv() * world(foot),
-        }
-        for joint, turned in new.items():
-            quaternion = turned.as_quat(scalar_first=True)
-            # the same side of the double cover as before: no sign jumps in files
-            quaternion *= np.where((quaternion * local[:, joint]).sum(1, keepdims=True) < 0, -1.0, 1.0)
+        turned = turned_locals(skeleton, rotations, local, leg.joints, (found.upper, found.lower, None))
+        for joint, quaternion in zip(leg.joints, turned, strict=True):
             local[moved, joint] = quaternion[moved]
     return local, reachable
+
+
+def turned_locals(
+    skeleton: Skeleton,
+    rotations_world: Float[np.ndarray, "frames joints 4"],
+    local: Float[np.ndarray, "frames joints 4"],
+    joints: tuple[int, ...],
+    turns: Sequence[Rotation | None],
+) -> list[Float[np.ndarray, "frames 4"]]:
+    """Joint-to-parent rotations of a limb's joints, from the top down, when each is turned in the world. One without
+    a turn keeps its way; joints between (twist bones) turn with the one above them."""
+    above, result = None, []
+    for joint, turn in zip(joints, turns, strict=True):
+        parent, own = rotations_world[:, skeleton.parents[joint]], rotations_world[:, joint]
+        if above is not None:
+            parent = host_product(above, parent)
+        if turn is not None:
+            above = turn.as_quat(scalar_first=True)
+            own = host_product(above, own)
+        quaternion = host_product(parent * CONJUGATE, own)
+        # the same side of the double cover as before: no sign jumps in files
+        same_side = np.where((quaternion * local[:, joint]).sum(1, keepdims=True) < 0, -1.0, 1.0)
+        result.append(quaternion * same_side)
+    return result
 
 
 def calm_feet(motion: Motion, rows: Int[np.ndarray, "frames 2"]) -> Motion:
@@ -253,16 +265,14 @@ def calm_feet(motion: Motion, rows: Int[np.ndarray, "frames 2"]) -> Motion:
     skeleton, dt = motion.skeleton, float(motion.dt)
     local, width = np.array(motion.rotations, float), 2 * round(TREMOR / dt / 2) + 1
     world = leg_kinematics(motion)[1]
-    for foot, side in enumerate(SIDES):
-        ankle, toe = skeleton.joint(f"{side}_foot"), skeleton.find(f"{side}_toe")
+    for foot, (ankle, *toe) in enumerate(foot_joints(skeleton)):
         turned = world[:, ankle].copy()
         for start, end in runs(rows[:, foot] >= 0):
             part = slice(start, end + 1)
             turned[part] = _mean_rotation(turned[part], width)
-            if toe is not None:
-                local[part, toe] = _mean_rotation(local[part, toe], width)
-        above = Rotation.from_quat(world[:, skeleton.parents[ankle]], scalar_first=True)
-        new = (above.inv() * Rotation.from_quat(turned, scalar_first=True)).as_quat(scalar_first=True)
+            for joint in toe:
+                local[part, joint] = _mean_rotation(local[part, joint], width)
+        new = host_product(world[:, skeleton.parents[ankle]] * CONJUGATE, turned)
         new *= np.where((new * local[:, ankle]).sum(1, keepdims=True) < 0, -1.0, 1.0)
         planted = rows[:, foot] >= 0
         local[planted, ankle] = new[planted]

@@ -36,10 +36,11 @@ def root_steps(
     if len(at):
         around = np.clip(at + np.arange(-1, 3)[:, None], 0, frames - 1)
         first, second = now[at], then[at]
-        slow = speed[around, first], speed[around, second]
-        q = transfer_instant(*slow)
+        both = np.stack([first, second])
+        slow = speed[around[:, None], both]
+        q = transfer_instant(slow[:, 0], slow[:, 1])
         q = np.where(foot_of[first] == foot_of[second], np.round(q), q)
-        leave, take = (place_at(offsets[around, v], s, q) for v, s in zip((first, second), slow, strict=True))
+        leave, take = place_at(offsets[around[:, None], both], slow, np.stack([q, q]))
         steps[at] = offsets[at, first] - leave + take - offsets[at + 1, second]
     return steps, held
 
@@ -89,11 +90,17 @@ def carry_over_flights(correction: Float[np.ndarray, "steps 3"], held: Bool[np.n
     for start, end in runs(~held):
         before, after = correction[max(start - width, 0) : start], correction[end + 1 : end + 1 + width]
         before, after = before[held[max(start - width, 0) : start]], after[held[end + 1 : end + 1 + width]]
-        ends = [np.median(c, axis=0) for c in (before, after) if len(c)]
+        ends = [_median(c) for c in (before, after) if len(c)]
         if not ends:
             continue
         share = (np.arange(end - start + 1) + 1.0)[:, None] / (end - start + 2)
         correction[start : end + 1] = ends[0] + share * (ends[-1] - ends[0])
+
+
+def _median(x: Float[np.ndarray, "rows k"]) -> Float[np.ndarray, " k"]:
+    """Of each column; `numpy.median` takes five times as long on a few rows."""
+    ordered, half = np.sort(x, axis=0), len(x) // 2
+    return 0.5 * (ordered[half] + ordered[(len(x) - 1) // 2])
 
 
 def vertical_scale(

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from motionfit._character import PARTS, Character
-from motionfit._motion import Motion, bind_pose
+from motionfit._motion import Motion, bind_pose, host_matrices
 from motionfit._skeleton import SIDES, Skeleton
 from motionfit._types import InputError
 
@@ -22,13 +22,13 @@ class Sole(NamedTuple):
     """Sole vertices of both feet, and what moves them.
 
     `vertices` are indices into the character's mesh and `side` says whose they are (0 left, 1 right). Each of the
-    `bones` carries some: it names a joint, the rows of `vertices` that it moves, their positions in that joint's
-    frame [m] and their skin weights.
+    `joints` has four rows in `carried`: where the vertices are in its frame [m] times their skin weight, and the weight.
     """
 
     vertices: Int[np.ndarray, " soles"]
     side: Int[np.ndarray, " soles"]
-    bones: tuple[tuple[int, np.ndarray, np.ndarray, np.ndarray], ...]
+    joints: tuple[int, ...]
+    carried: Float[np.ndarray, "rows soles"]
     skeleton: Skeleton
 
     def of(self, foot: int) -> Int[np.ndarray, " soles_of_foot"]:
@@ -82,7 +82,7 @@ def _find_sole(character: Character, cells: int | None, include: tuple[int, ...]
         chosen.append(np.union1d(thin, np.intersect1d(mine, np.array(include, int))))
         side.append(np.full(len(chosen[-1]), foot))
     picked = np.concatenate(chosen)
-    return Sole(picked, np.concatenate(side), _bones(character, picked), skeleton)
+    return Sole(picked, np.concatenate(side), *_carried(character, picked), skeleton)
 
 
 def _facing_down(vertices: np.ndarray, faces: np.ndarray, mine: np.ndarray) -> np.ndarray:
@@ -109,29 +109,19 @@ def _lowest_per_cell(vertices: np.ndarray, low: np.ndarray, cells: int) -> np.nd
     return np.sort(low[order[first]])
 
 
-def _bones(character: Character, picked: np.ndarray) -> tuple:
+def _carried(character: Character, picked: np.ndarray) -> tuple[tuple[int, ...], Float[np.ndarray, "rows soles"]]:
+    """The joints that move the picked vertices, and `Sole.carried`."""
     positions, rotations = bind_pose(character.skeleton)
     joints = np.asarray(character.skin.joints)[picked]
     weights = np.asarray(character.skin.weights, float)[picked]
     weights = weights / weights.sum(1, keepdims=True)
     bind = np.asarray(character.skin.vertices_bind, float)[picked]
-    bones = []
-    for joint in np.unique(joints[weights > 0]):
+    found, rows = np.unique(joints[weights > 0]).tolist(), []
+    for joint in found:
         weight = np.where(joints == joint, weights, 0.0).sum(1)
-        rows = np.flatnonzero(weight > 0)
-        local = (bind[rows] - positions[joint]) @ _matrix(rotations[joint])
-        bones.append((int(joint), rows, local, weight[rows]))
-    return tuple(bones)
-
-
-def _matrix(q: Float[np.ndarray, "... 4"]) -> Float[np.ndarray, "... 3 3"]:
-    """Rotation matrices of unit quaternions wxyz, on the host."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    m = np.empty((*q.shape[:-1], 3, 3))
-    m[..., 0, 0], m[..., 0, 1], m[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    m[..., 1, 0], m[..., 1, 1], m[..., 1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    m[..., 2, 0], m[..., 2, 1], m[..., 2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-    return m
+        local = (bind - positions[joint]) @ host_matrices(rotations[joint])
+        rows += [*(weight * local.T), weight]
+    return tuple(found), np.array(rows)
 
 
 def chain_kinematics(
@@ -149,7 +139,7 @@ def chain_kinematics(
             joint = parents[joint]
     offsets = np.asarray(motion.skeleton.offsets, float)
     order = sorted(needed)
-    local = _matrix(np.asarray(motion.rotations)[:, order].astype(float))
+    local = host_matrices(np.asarray(motion.rotations)[:, order].astype(float))
     world: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     for k, joint in enumerate(order):
         parent = parents[joint]
@@ -164,14 +154,14 @@ def chain_kinematics(
 
 
 def sole_paths(sole: Sole, motion: Motion) -> Float[np.ndarray, "frames soles 3"]:
-    """World position [m] of every sole vertex in every frame: linear blend skinning, thesis (4.20)."""
-    world = chain_kinematics(motion, tuple(b[0] for b in sole.bones))
-    paths = np.zeros((motion.frame_count, len(sole.vertices), 3))
-    for joint, rows, local, weight in sole.bones:
-        turn, place = world[joint]
-        moved = np.matmul(local, np.swapaxes(turn, 1, 2)) + place[:, None]
-        paths[:, rows] += weight[:, None] * moved
-    return paths
+    """World position [m] of every sole vertex in every frame: linear blend skinning, thesis (4.20), as one product of
+    all joints' [turn | place] with what they carry."""
+    world, frames = chain_kinematics(motion, sole.joints), motion.frame_count
+    poses = np.empty((frames, 3, len(sole.joints), 4))
+    for k, joint in enumerate(sole.joints):
+        poses[:, :, k, :3], poses[:, :, k, 3] = world[joint]
+    paths = poses.reshape(3 * frames, -1) @ sole.carried
+    return np.ascontiguousarray(np.swapaxes(paths.reshape(frames, 3, -1), 1, 2))
 
 
 def rows_of(sole: Sole, vertex: Int[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:

@@ -118,7 +118,7 @@ def transfer_instant(
     `speeds_*` [m/s] are those of both vertices at frames t-1, t, t+1, t+2. Of several crossings the first after
     which the next vertex is the slower one counts. Without a crossing the slower vertex holds the whole step.
     """
-    difference = catmull_rom(speeds_from) - catmull_rom(speeds_to)
+    difference = catmull_rom(speeds_from - speeds_to)
     roots = cubic_roots(difference)
     inside = np.isfinite(roots) & (roots >= 0) & (roots <= 1)
     a, b, c, _ = difference

@@ -96,9 +96,9 @@ def move_limb(
     """
     chord, goal = ankle_world - hip_world, target_world - hip_world
     swing = shortest(chord, goal)
-    thigh, shank = swing.apply(knee_world - hip_world), swing.apply(ankle_world - knee_world)
-    forward = _unit(np.where(np.linalg.norm(goal, axis=1, keepdims=True) > 1e-9, goal, swing.apply(chord)))
-    lateral = swing.apply(lateral_world)
+    apart = np.stack([knee_world - hip_world, ankle_world - knee_world, lateral_world, chord], axis=2)
+    thigh, shank, lateral, swung = np.moveaxis(swing.as_matrix() @ apart, 2, 0)
+    forward = _unit(np.where(np.linalg.norm(goal, axis=1, keepdims=True) > 1e-9, goal, swung))
     lengths = np.linalg.norm(thigh, axis=1) * np.linalg.norm(shank, axis=1)
     bend = np.cross(thigh, shank) / np.maximum(lengths, 1e-12)[:, None]
     # both ways to bend have the same axis: taken to the side of the anatomical one, the two never cancel
