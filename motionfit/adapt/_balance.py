@@ -21,7 +21,7 @@ from motionfit._skeleton import SIDES
 from motionfit._types import InputError
 from motionfit.adapt._clearance import build_clearance, volume_depths
 from motionfit.adapt._controls import lean_controls
-from motionfit.adapt._limits import ENOUGH, reference_depths
+from motionfit.adapt._limits import NEARLY, reference_depths
 from motionfit.adapt._record import recorded
 from motionfit.adapt._sampling import Sampling, sampling
 from motionfit.adapt._standing import weighed
@@ -218,7 +218,7 @@ def _sinking(clip: Motion, character: Character, reference: Character | None, so
 
     def sinks(motion: Motion) -> bool:
         now = volume_depths(clearance, at.motion(motion)) - limit
-        return bool((now > np.maximum(before + 0.001, ENOUGH * TOLERANCE)).any())
+        return bool((now > np.maximum(before + 0.001, NEARLY * TOLERANCE)).any())
 
     return sinks
 

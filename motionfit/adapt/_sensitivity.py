@@ -39,10 +39,9 @@ from motionfit._types import InputError
 from motionfit.adapt._clearance import Clearance, build_clearance, volume_depths
 from motionfit.adapt._limbs import ALLOWED_EXCESS, LIMBS, SOLVE_PROBES, Stage
 from motionfit.adapt._limbs import _stages as limb_stages
-from motionfit.adapt._limits import ENOUGH
 from motionfit.adapt._touches import touching_on
 from motionfit.banded import Banded
-from motionfit.metrics import TOLERANCE, skin_depths
+from motionfit.metrics import skin_depths
 from motionfit.shape.field import DepthField, Probes, standing, standing_vertices
 from motionfit.shape.growth import grow
 from motionfit.shape.pairs import pairs_of
@@ -187,8 +186,7 @@ class Held(NamedTuple):
         return Problem(body, onto(problem.motion, body.skeleton), terms, problem.controls, problem.weights)
 
     def _touching(self, term: TouchClearance, reference: Character | None) -> TouchClearance:
-        """The touches with what another reference shows in the frames that were looked at. Where less was allowed than
-        the reference shows, since it will show less once the clip is adapted, that is held."""
+        """The touches with what another reference shows in the frames that were looked at."""
         if reference is None or self.reference is None or not len(term.found):
             return term
         looks, at = np.unique(np.asarray(term.found)[..., 0], return_inverse=True)
@@ -196,9 +194,7 @@ class Held(NamedTuple):
         clip = self.problem.motion[looks]
         before, after = (skin_depths(r, onto(clip, r.skeleton), pairs).depth for r in (self.reference, reference))
         place = at.reshape(term.found.shape[:2]), np.asarray(term.found)[..., 1]
-        allowed = np.asarray(term.allowed)
-        shown = np.abs(allowed - before[place] - ALLOWED_EXCESS) < 1e-4
-        return eqx.tree_at(lambda t: t.allowed, term, allowed + np.where(shown, (after - before)[place], 0.0))
+        return eqx.tree_at(lambda t: t.allowed, term, np.asarray(term.allowed) + (after - before)[place])
 
     def _term(self, stage: Stage) -> Seen:
         term = self.problem.terms[f"{stage.block.name}_clearance"]
@@ -225,8 +221,7 @@ class Held(NamedTuple):
             objective = "vertex" if isinstance(mine.term, SkinClearance) else "capsule"
             theirs = build_clearance(self.reference, mine.pairs, objective)
             own = _depths(theirs, self.reference, reference, onto(clip, reference.skeleton))
-        kept = own + ALLOWED_EXCESS
-        kept = np.where([p.adjacent for p in mine.pairs], kept, np.minimum(kept, ENOUGH * TOLERANCE))
+        kept = own + [ALLOWED_EXCESS[p.block] for p in mine.pairs]
         return np.where(alone, np.maximum(before, own), kept)
 
 
