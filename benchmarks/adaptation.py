@@ -68,10 +68,13 @@ def constant_offset(fit: mf.Fit, character: mf.Character, own: np.ndarray, at: n
             tilts = [(0, 0), *((a, b) for a in (-0.4, 0, 0.4) for b in (-0.4, 0, 0.4) if (a, b) != (0, 0))]
             for a, b in tilts if block == "arms" else tilts[:1]:
                 tilt = Rotation.from_rotvec([0.0, a, b])
-                if not enough(best, tilt):
+                # from below: an arm that is far out may come upon something else
+                tried = (angle for angle in (0.0, *np.arange(0.05, 1.2, 0.05)) if angle < best)
+                high = next((angle for angle in tried if enough(angle, tilt)), None)
+                if high is None:
                     continue
-                low, high = 0.0, best
-                for _ in range(9):
+                low = max(high - 0.05, 0.0)
+                for _ in range(5 if high else 0):
                     middle = (low + high) / 2
                     low, high = (low, middle) if enough(middle, tilt) else (middle, high)
                 best, chosen = high, tilt

@@ -235,7 +235,7 @@ def reduced(
 
 
 def allowance(
-    excess: Float[np.ndarray, "frames pairs"], tolerance: Float[np.ndarray, "*pairs"], margin: float
+    excess: Float[np.ndarray, "frames pairs"], tolerance: float, margin: float
 ) -> Float[np.ndarray, "frames pairs"]:
     """How much excess [m] over the reference a frame may keep.
 
@@ -243,5 +243,5 @@ def allowance(
     taken linearly over one tolerance, so that the wish is continuous in the motion. The gap between the two
     makes adaptation idempotent: what was adapted once shows less than the tolerance and stays as it is.
     """
-    share = np.clip((excess - tolerance) / np.maximum(tolerance, 1e-9), 0.0, 1.0)
+    share = np.clip((excess - tolerance) / max(tolerance, 1e-9), 0.0, 1.0)
     return tolerance - margin * share

@@ -29,9 +29,9 @@ LIMBS = ("arms", "legs")
 
 RATE = 30.0  # [1/s] of the frames that the solver sees: three for every knot
 SOLVE_PROBES = {"upper_arm": 20, "forearm": 16, "hand": 12, "thigh": 20, "calf": 20}  # per pair, of those looked at
-# [m] that may stay where more was; well under TOLERANCE, which the skin is judged by. A body that leans and comes down
-# to balance brings its thighs some 2 mm nearer
-ALLOWED_EXCESS = {"arms": 0.004, "legs": 0.002}
+# [m] that may stay where more was; well under TOLERANCE, which the skin is judged by: much that is in a little adds up
+# too, and a body that leans and comes down to balance brings its thighs some 2 mm nearer
+ALLOWED_EXCESS = 0.002
 MARGIN = 0.001  # [m]
 LEAST_GAP = 0.005  # [m]
 # Across and twist are there for what r alone cannot do, and the skin around a shoulder is known least where it twists
@@ -131,7 +131,7 @@ def limbs(
         looks.look_closer(excess.max(axis=1))
         quiet = excess.max(axis=0) <= slack * TOLERANCE
         quiet &= looks.quiet(looks.depths(small))
-    kept = own + allowance(excess, np.array([ALLOWED_EXCESS[p.block] for p in pairs]), MARGIN)
+    kept = own + allowance(excess, ALLOWED_EXCESS, MARGIN)
     if start is not None:
         _check_start(start, seen, pairs)
     allowed = np.where(quiet, np.maximum(before, own), kept)
@@ -351,7 +351,7 @@ def _problem(
             terms[name] = stage.clearance.allowing(limit)
         if looks is not None and f"{stage.block.name}_touches" in (stage.block.terms or ()):
             awake = np.array(stage.columns)[~stage.quiet]
-            terms[f"{stage.block.name}_touches"] = looks.touch_term(awake, ALLOWED_EXCESS["arms"], length)
+            terms[f"{stage.block.name}_touches"] = looks.touch_term(awake, ALLOWED_EXCESS, length)
     frames = np.arange(length)
     effort = Effort(np.array([SIGMA_EFFORT[c.name] for c in seen.controls]))
     terms["effort"] = During(effort, (frames < real).astype(float))

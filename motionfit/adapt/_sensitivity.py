@@ -221,7 +221,7 @@ class Held(NamedTuple):
             objective = "vertex" if isinstance(mine.term, SkinClearance) else "capsule"
             theirs = build_clearance(self.reference, mine.pairs, objective)
             own = _depths(theirs, self.reference, reference, onto(clip, reference.skeleton))
-        kept = own + [ALLOWED_EXCESS[p.block] for p in mine.pairs]
+        kept = own + ALLOWED_EXCESS
         return np.where(alone, np.maximum(before, own), kept)
 
 
