@@ -51,6 +51,7 @@ WIDE = np.deg2rad(45.0)  # a turn that makes one look for a shorter way out
 STARTS = tuple(np.deg2rad(s) for s in ((30.0, 0.0, 0.0), (30.0, 30.0, 30.0), (30.0, -30.0, -30.0)))
 ROUNDS, PATIENCE = 9, 2  # rounds at most, and rounds without a better result
 FEW_FAULTS = 0.005
+LESS = 0.8  # of the mean square of all turns: a tenth of the turns themselves
 CLOSER = (0, 1)  # rounds after which more frames are looked at
 
 
@@ -75,6 +76,20 @@ class Iterate(NamedTuple):
     depths: Float[np.ndarray, "frames pairs"]
     held_back: Float[np.ndarray, "frames pairs"]
     left: float  # [m]
+
+    @property
+    def clean(self) -> bool:
+        return self.faults < FEW_FAULTS and self.left <= NEARLY * TOLERANCE
+
+    @property
+    def turn(self) -> float:
+        """Mean square of the control points, each by its `SIGMA_EFFORT`."""
+        points = zip(self.correction.controls, self.correction.points, strict=True)
+        return sum(float(np.square(np.asarray(p) / SIGMA_EFFORT[c.name]).mean()) for c, p in points)
+
+    def better_than(self, other: "Iterate") -> bool:
+        """Fewer faults; of two that are clean the one that turns clearly less, since it is nearer to sinking in."""
+        return self.turn < LESS * other.turn if self.clean and other.clean else self.faults < other.faults
 
 
 class Seen(NamedTuple):
@@ -146,7 +161,7 @@ def limbs(
     correction = Correction(seen.controls, tuple(_filled(p, seen.basis.count) for p in points))
     if start is not None and looks is not None:
         looks.depths_and_touches(_final(controls, whole, correction).apply(base)[seen.frames])
-    best, since = Iterate(np.inf, correction, None, before, held_back, np.inf), 0
+    best, since, easing = Iterate(np.inf, correction, None, before, held_back, np.inf), 0, False
     steps = sweeps * len(stages)
 
     def told(round_: int):
@@ -177,11 +192,16 @@ def limbs(
         jerk = derivative_ratio(_final(controls, whole, correction).apply(base), base, 3) or 1.0
         faults = max(jerk - MOST_JERK, 0.0) / 0.2 + _amount(left) / TOLERANCE
         # one that was looked at in fewer frames cannot be compared
-        if faults < best.faults or round_ in CLOSER:
-            best, since = Iterate(faults, correction, result.problem, after, allowed - used, left.max(initial=0.0)), 0
+        found = Iterate(faults, correction, result.problem, after, allowed - used, left.max(initial=0.0))
+        if found.better_than(best) or round_ in CLOSER:
+            best, since = found, 0
         since += 1
-        done = faults < FEW_FAULTS and left.max(initial=0.0) <= NEARLY * TOLERANCE
-        if (done and round_ >= CLOSER[-1]) or since > PATIENCE:
+        easing |= found.clean and round_ >= CLOSER[-1]
+        if easing:
+            if looks is None or not looks.ease(on_skin, ALLOWED_EXCESS):
+                break
+            continue
+        if since > PATIENCE:
             break
         if jerk > MOST_JERK:
             smooth *= 0.5

@@ -2,6 +2,7 @@
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import maximum_filter1d
 
 from motionfit._character import Character
 from motionfit._motion import Motion, host_kinematics, rest_motion
@@ -16,6 +17,8 @@ LEAST_LOOKS, LOOK_SHARE = 16, 1 / 15  # looks at the skin: at least, and per fra
 NEARLY = 0.9  # of TOLERANCE: what a result may show, since between two looks there may be a little more
 LOOKS_APART = 2  # [frames] that two looks are at least apart
 ENOUGH = 0.7  # of TOLERANCE: what a look may still show
+FARTHER = 0.005  # [m] out than need be, from which on touches are eased
+EASES = (0.5, 0.25, 0.0)  # of what was found, one after the other
 
 
 def reference_depths(
@@ -45,6 +48,8 @@ class SkinLooks:
         self.at: Int[np.ndarray, " looks"] = np.unique(np.linspace(0, clip.frame_count - 1, count).round().astype(int))
         self.own = self._own(self.at)
         self.touches: dict[int, Touches] = {}
+        self.deepest = np.zeros_like(self.own)  # [m] of excess in any look, where touches were found
+        self.eased = np.zeros_like(self.own)  # the share of it that touches may show again
 
     def _own(self, at: Int[np.ndarray, " some"]) -> Float[np.ndarray, "some pairs"]:
         """What the reference shows."""
@@ -63,12 +68,32 @@ class SkinLooks:
                 result[i, pair] = max(result[i, pair], inside.depth.max(initial=0.0))
             new, frame = touches_of(self.character, rotations[i], vertices, found, self.own[i]), int(self.at[i])
             self.touches[frame] = new.then(self.touches[frame]) if frame in self.touches else new
+        if not self.eased.any():
+            self.deepest = np.maximum(self.deepest, result - self.own)
         return result
 
     def touch_term(self, columns: Int[np.ndarray, " some"], allowed: float, length: int) -> TouchClearance:
         """The touches of some pairs as rows for the solver, up to `allowed` [m] more than the reference shows."""
-        limits = {int(frame): row + allowed for frame, row in zip(self.at, self.own, strict=True)}
+        rows = self.own + allowed + self.eased * np.maximum(self.deepest - allowed, 0.0)
+        limits = {int(frame): row for frame, row in zip(self.at, rows, strict=True)}
         return touch_term(self.character, self.touches, columns, limits, len(self.frames), length)
+
+    def ease(self, seen: Float[np.ndarray, "looks pairs"], allowed: float) -> bool:
+        """Let touches show more where the skin came out farther than it had to; says whether there is more to try.
+
+        A touch was found in another pose, and on the way from there a fold opens faster than its rows say. So half of
+        what was found may show again, and less of it where the skin then sinks in.
+        """
+        excess = seen - self.own
+        if not self.eased.any():
+            farther = (self.deepest > ENOUGH * TOLERANCE) & (excess < allowed - FARTHER)
+            self.eased[:] = EASES[0] if farther.any() else 0.0
+            return bool(farther.any())
+        sinks = maximum_filter1d(excess, 3, axis=0) > ENOUGH * TOLERANCE  # a spline takes its neighbours along
+        less = np.where(self.eased > EASES[1], EASES[1], EASES[2])
+        wanted = bool((sinks & (self.eased > 0.0)).any())
+        self.eased = np.where(sinks, less, self.eased)
+        return wanted
 
     def look_closer(self, risk: Float[np.ndarray, " frames"]) -> None:
         """Look at more frames from now on: those of greatest `risk`, apart from each other and from former looks."""
@@ -81,6 +106,8 @@ class SkinLooks:
         if taken:
             order = np.argsort(at := np.concatenate([self.at, taken]))
             self.own = np.concatenate([self.own, self._own(np.array(taken))])[order]
+            none = np.zeros((len(taken), len(self.pairs)))
+            self.deepest, self.eased = (np.concatenate([x, none])[order] for x in (self.deepest, self.eased))
             self.at = at[order]
 
     def quiet(self, seen: Float[np.ndarray, "looks pairs"]) -> Bool[np.ndarray, " pairs"]:
