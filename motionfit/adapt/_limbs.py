@@ -79,7 +79,7 @@ class Iterate(NamedTuple):
 
     @property
     def clean(self) -> bool:
-        return self.faults < FEW_FAULTS and self.left <= NEARLY * TOLERANCE
+        return bool(self.faults < FEW_FAULTS and self.left <= NEARLY * TOLERANCE)
 
     @property
     def turn(self) -> float:
@@ -89,7 +89,7 @@ class Iterate(NamedTuple):
 
     def better_than(self, other: "Iterate") -> bool:
         """Fewer faults; of two that are clean the one that turns clearly less, since it is nearer to sinking in."""
-        return self.turn < LESS * other.turn if self.clean and other.clean else self.faults < other.faults
+        return bool(self.turn < LESS * other.turn if self.clean and other.clean else self.faults < other.faults)
 
 
 class Seen(NamedTuple):
