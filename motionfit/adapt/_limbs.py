@@ -132,7 +132,8 @@ def limbs(
     everything = build_clearance(character, pairs_of(*blocks), objective)
     pairs, small = everything.pairs, seen.motion
 
-    source = (source or clip)[seen.frames]
+    known = source is not None
+    source = (clip if source is None else source)[seen.frames]
     own = reference_depths(source, character, reference, pairs, objective)
     before = volume_depths(everything, small)
     excess = before - own
@@ -143,7 +144,9 @@ def limbs(
         quiet = excess.max(axis=0) <= TOLERANCE
     else:
         looks = SkinLooks(source, character, reference, pairs)
-        looks.look_closer(excess.max(axis=1))
+        # the frames that were looked at when an adapted clip was made
+        first = volume_depths(everything, onto(source, character.skeleton)) - own if known else excess
+        looks.look_closer(first.max(axis=1))
         quiet = excess.max(axis=0) <= slack * TOLERANCE
         quiet &= looks.quiet(looks.depths(small))
     kept = own + allowance(excess, ALLOWED_EXCESS, MARGIN)
@@ -169,6 +172,7 @@ def limbs(
             return None
         return lambda name, done, _: progress(name, round_ * steps + done, ROUNDS * steps)  # pyright: ignore[reportOptionalCall]
 
+    settled = known and bool(quiet.all())  # and what is settled was looked at closely then
     for round_ in range(ROUNDS):
         problem = _problem(character, seen, stages, smooth, everything, (small, moved), looks)
         result = fit(problem, _side_by_side(stages), sweeps, correction=correction, progress=told(round_))
@@ -181,7 +185,7 @@ def limbs(
         if looks is None:
             left = np.where(quiet, 0.0, after - own)
         else:
-            if round_ in CLOSER:
+            if round_ in CLOSER and not settled:
                 looks.look_closer((after - own).max(axis=1))
             on_skin = looks.depths_and_touches(moved)
             # what the first looks missed
@@ -196,7 +200,7 @@ def limbs(
         if found.better_than(best) or round_ in CLOSER:
             best, since = found, 0
         since += 1
-        easing |= found.clean and round_ >= CLOSER[-1]
+        easing |= found.clean and (settled or round_ >= CLOSER[-1])
         if easing:
             if looks is None or not looks.ease(on_skin, ALLOWED_EXCESS):
                 break

@@ -65,6 +65,7 @@ def adapt(
     if girth:
         reference, character = reference or character, grow(character, girth)
     body = character.fingerprint
+    adapted = clip.source_on(body) is not clip
     source, clip = (dataclasses.replace(m, source=None) for m in (clip.source_on(body), clip))
     base = onto(clip, character.skeleton)
     first, later = (tuple(b for b in some if b in blocks) for some in (LIMBS, LATER))
@@ -76,7 +77,7 @@ def adapt(
 
     if first:
         fit = limbs(clip, character, reference=reference, blocks=first, objective=objective, sweeps=sweeps,
-                    start=start, source=source, progress=functools.partial(told, 0))  # fmt: skip
+                    start=start, source=source if adapted else None, progress=functools.partial(told, 0))  # fmt: skip
     else:
         fit = Fit(Correction((), ()), base, base, "converged", (), Problem(character, base, {}, ()))
     # what the source drifts is its own, unless nothing else is asked for
