@@ -138,12 +138,13 @@ def balance(
         some = _stood(so_far, controls, at, points, feet, share, part)
         return some, _distance(character, some.motion, stance, planted)
 
-    for part in (0.5, 0.25, 0.0) if sunk else ():
-        # rather less balanced than a part in another
+    failed = sunk or jerk > MOST_JERK
+    for part in (0.75, 0.5, 0.25, 0.0) if failed else ():
+        # rather less balanced than a part in another, or a jerk
         result, after = stood(part)
-        if not sinks(result.motion):
+        if not sinks(result.motion) and (derivative_ratio(result.motion, motion, 3) or 1.0) <= MOST_JERK:
             break
-    if not sunk and _mean(after) < CARTOON * wanted:
+    if not failed and _mean(after) < CARTOON * wanted:
         # the thresholds hold what was farther and let be what was nearer, so that the mean ends under the source's:
         # what is more than was asked for is given back
         part = _crossing(lambda part: _mean(stood(part)[1]) - wanted)
