@@ -11,9 +11,9 @@ import motionfit as mf
 from motionfit import samples
 from motionfit._control import Correction
 from motionfit._fit import Fit
-from motionfit._motion import joint_angles
+from motionfit._motion import continued, joint_angles
 from motionfit.adapt import footskate, measure_standing, source_stance
-from motionfit.balance import balance_measures, sole_boxes, zmp_distance
+from motionfit.balance import ZmpDistance, balance_measures, sole_boxes, zmp_distance
 from motionfit.cli import main
 from motionfit.metrics import derivative_ratio
 from motionfit.shape.mass import mesh_masses
@@ -121,11 +121,16 @@ def test_balance_entry_is_that_of_the_balance_module(average, heavy):
     down = mf.detect_footplants(on_average, average)
 
     def distance(body, motion):
-        kin = mf.forward_kinematics(body.skeleton, motion)
-        ground = mf.detect_footplants(motion, body).floor.at(np.asarray(motion.root))
-        return zmp_distance(kin, mesh_masses(body), sole_boxes(body), down.planted, ground=ground)
+        count, more = motion.frame_count, 40  # it goes on past its end, however long
+        kin = mf.forward_kinematics(body.skeleton, continued(motion, count + more))
+        ground = np.pad(mf.detect_footplants(motion, body).floor.at(np.asarray(motion.root)), (0, more), "edge")
+        planted = np.pad(down.planted, ((0, more), (0, 0)))
+        found = zmp_distance(kin, mesh_masses(body), sole_boxes(body), planted, ground=ground)
+        return ZmpDistance(found.signed[:count], found.supported[:count])
 
-    assert found == balance_measures(distance(heavy, on_heavy), distance(average, on_average))
+    expected = balance_measures(distance(heavy, on_heavy), distance(average, on_average))
+    assert expected["zmp_distance_mean_m"] > 0.01
+    assert found == pytest.approx(expected, rel=1e-6)
     assert standing(heavy, on_heavy, source_stance(heavy, on_heavy))["balance"]["excess_over_reference_mean_m"] is None
 
 
@@ -158,9 +163,15 @@ def test_commands_report_feet_and_balance(monkeypatch, capsys, tmp_path):
     for name in ("before", "after"):
         assert all(np.isfinite(v) for v in data[name]["feet"].values() if v is not None)
         assert None not in data[name]["balance"].values()
-    # what the reference plays is said where it is the measured clip itself, and only there
+    # the file holds its source, and the reference plays that
     arguments = "metrics", out, "builtin:heavy", "--reference", "builtin:average", "--json", measured
     code, said = run(monkeypatch, capsys, *arguments)
+    assert code == 0 and said == ""
+    same, after = (m["penetration"]["skin"]["excess_max_m"] for m in (json.loads(measured.read_text()), data["after"]))
+    assert same == pytest.approx(after, abs=1e-6)
+    # what the reference plays is said where it is the measured clip itself, and only there
+    mf.save(forgetful := tmp_path / "o.bvh", mf.load_motion(out))
+    code, said = run(monkeypatch, capsys, "metrics", forgetful, *arguments[2:])
     assert code == 0 and "--reference-clip" in said and said.count("\n") == 1
     code, said = run(monkeypatch, capsys, *arguments[:-2], "--reference-clip", out, "--json", measured)
     assert code == 0 and said == "" and json.loads(measured.read_text())["feet"]["contact_frames"] > 0

@@ -13,10 +13,9 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
 from motionfit._character import Character
 from motionfit._control import Control, Correction
 from motionfit._fit import Block, Fit, fit
-from motionfit._motion import Motion, bucket, continued, forward_kinematics, host_kinematics
+from motionfit._motion import Motion, continued, host_kinematics
 from motionfit._onto import onto
 from motionfit._problem import During, Problem
-from motionfit._programs import program
 from motionfit._skeleton import SIDES
 from motionfit._types import InputError
 from motionfit.adapt._clearance import build_clearance, volume_depths
@@ -24,8 +23,8 @@ from motionfit.adapt._controls import lean_controls
 from motionfit.adapt._limits import NEARLY, reference_depths
 from motionfit.adapt._record import recorded
 from motionfit.adapt._sampling import Sampling, sampling
-from motionfit.adapt._standing import weighed
-from motionfit.balance import WINDOW, Soles, ZmpDistance, zmp_distance
+from motionfit.adapt._standing import distances, weighed
+from motionfit.balance import WINDOW, Soles, ZmpDistance
 from motionfit.feet._leg import Leg, find_legs, turn_legs
 from motionfit.feet._remove import detect_footplants
 from motionfit.metrics import TOLERANCE, derivative_ratio
@@ -167,19 +166,8 @@ def _stance(body: Character, motion: Motion, floor) -> _Stance:
     return _Stance(masses, soles, floor.at(np.asarray(motion.root, float)))
 
 
-@program
-def _kinematics(skeleton, motion):
-    return forward_kinematics(skeleton, motion)
-
-
 def _distance(body: Character, motion: Motion, stance: _Stance, planted: np.ndarray) -> ZmpDistance:
-    """Distances in all frames, those that the solver does not see too: near flight they differ by centimetres from one
-    frame to the next."""
-    count = motion.frame_count
-    seen, more = continued(motion, bucket(count)), bucket(count) - count
-    found = zmp_distance(_kinematics(body.skeleton, seen), stance.masses, stance.soles,
-                         np.pad(planted, ((0, more), (0, 0))), ground=np.pad(stance.ground, (0, more), "edge"))  # fmt: skip
-    return ZmpDistance(np.asarray(found.signed)[:count], np.asarray(found.supported)[:count])
+    return distances(body, motion, stance.masses, stance.soles, planted, stance.ground)
 
 
 def _mean(distance: ZmpDistance, outside: np.ndarray | None = None) -> float:

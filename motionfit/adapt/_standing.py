@@ -3,9 +3,11 @@
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from motionfit._character import Character
-from motionfit._motion import Motion, forward_kinematics
+from motionfit._motion import Motion, bucket, continued, forward_kinematics
+from motionfit._programs import program
 from motionfit._types import InputError
 from motionfit.balance import Soles, ZmpDistance, balance_measures, sole_boxes, zmp_distance
 from motionfit.feet import Footplants, detect, find_sole, measure_feet
@@ -74,5 +76,23 @@ def _distance(
         masses, soles = weighed(character)
     except InputError:
         return None
-    kin = forward_kinematics(character.skeleton, motion)
-    return zmp_distance(kin, masses, soles, down.planted, ground=own.floor.at(np.asarray(motion.root, float)))
+    return distances(character, motion, masses, soles, np.asarray(down.planted),
+                     own.floor.at(np.asarray(motion.root, float)))  # fmt: skip
+
+
+def distances(
+    body: Character, motion: Motion, masses: Masses, soles: Soles, planted: Bool[np.ndarray, "frames 2"],
+    ground: Float[np.ndarray, " frames"],
+) -> ZmpDistance:  # fmt: skip
+    """Distances of the ZMP in all frames of a clip that goes on past its end at the speed it has there: filled up to a
+    bucket, so that clips share a program."""
+    count = motion.frame_count
+    seen, more = continued(motion, bucket(count)), bucket(count) - count
+    found = zmp_distance(_kinematics(body.skeleton, seen), masses, soles, np.pad(planted, ((0, more), (0, 0))),
+                         ground=np.pad(ground, (0, more), "edge"))  # fmt: skip
+    return ZmpDistance(np.asarray(found.signed)[:count], np.asarray(found.supported)[:count])
+
+
+@program
+def _kinematics(skeleton, motion):
+    return forward_kinematics(skeleton, motion)
