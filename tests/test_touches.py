@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 import motionfit as mf
 from motionfit import samples
 from motionfit._motion import host_kinematics
+from motionfit.adapt._limits import SkinLooks
 from motionfit.adapt._touches import KEPT, NEVER, touch_term, touches_of, touching_on
 from motionfit.metrics import insides, posed_vertices
 from motionfit.shape import grow
@@ -90,3 +91,20 @@ def test_touches_on_another_body_are_those_of_the_same_vertices(heavy, clip):
     np.testing.assert_allclose(told[real], ways_on(body, moved, term)[real], atol=1e-6)
     itself = np.asarray(touching_on(term, heavy).blend)
     np.testing.assert_allclose(itself[real], np.asarray(term.blend)[real], atol=1e-12)
+
+
+def test_touches_give_way_where_the_skin_is_out_too_far():
+    looks = object.__new__(SkinLooks)  # what it decides by, without a body
+    looks.own, looks.deepest, looks.eased = np.full((5, 2), 0.01), np.full((5, 2), 0.006), np.zeros((5, 2))
+    out = np.zeros((5, 2))
+    assert not looks.ease(out, 0.002) and not looks.eased.any()  # too little was found
+    looks.deepest[:, 0] = 0.02
+    assert not looks.ease(looks.own, 0.002)  # nothing is out farther than it had to
+    assert looks.ease(out, 0.002) and (looks.eased == 0.5).all()
+    sunk = out.copy()
+    sunk[2, 0] = looks.own[2, 0] + 0.008
+    for share in (0.25, 0.0):
+        assert looks.ease(sunk, 0.002)
+        np.testing.assert_array_equal(looks.eased[:, 0], [0.5, share, share, share, 0.5])
+        assert (looks.eased[:, 1] == 0.5).all()
+    assert not looks.ease(out, 0.002)
