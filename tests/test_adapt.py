@@ -136,6 +136,10 @@ def test_real_walk_on_a_real_heavy_body(shared_data):
     assert ((before.depth - own.depth) > 0.01).any(1).mean() > 0.9
     assert ((after.depth - own.depth) > 0.01).any(1).mean() <= 0.02
     assert after.inside_ratio <= own.inside_ratio + 0.002
+    # the thighs leave the balance block room to lean
+    balance = fit.details["balance"]
+    assert balance["zmp_distance_before_m"] > 0.02
+    assert balance["zmp_distance_after_m"] <= balance["zmp_distance_source_m"] + 0.001
 
 
 def test_hands_deep_in_a_belly_find_one_way_out(shared_data):
