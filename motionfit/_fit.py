@@ -18,7 +18,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from motionfit._control import Control, Correction
-from motionfit._motion import Motion
+from motionfit._motion import Kinematics, Motion
 from motionfit._problem import Custom, Energy, Objective, Problem, Term, term_cost
 from motionfit._programs import program
 from motionfit._types import AnyArray, InputError
@@ -144,6 +144,11 @@ def _columns_of_signals(x, fn):
     return jax.vmap(lambda seed: jax.jvp(fn, (x,), ((seed,),)), out_axes=(None, 0))(seeds)
 
 
+def _columns_of_points(banded: Banded, x: tuple[Array, ...], rows: "_PointRows"):
+    value, product = rows.linearised(x)
+    return value, banded.columns_of(x, product)
+
+
 def _times_signals(columns, t_x):
     return jax.tree.map(lambda c: jnp.einsum("tc,ctn->tn", t_x[0], c), columns)
 
@@ -158,10 +163,14 @@ class _Rows(eqx.Module):
 
     @eqx.filter_jit  # traced once, however often a solver's program evaluates it
     def __call__(self, x: tuple[Float[Array, "frames free"]]) -> tuple[Float[Array, "frames _"], ...]:
-        (signals,) = x
-        kin = self.objective.kinematics(self.fixed.at[:, self.free].set(signals))
+        return self.of(self.kinematics(x))
+
+    def kinematics(self, x: tuple[Float[Array, "frames free"]]) -> Kinematics:
+        return self.objective.kinematics(self.fixed.at[:, self.free].set(x[0]))
+
+    def of(self, kin: Kinematics) -> tuple[Float[Array, "frames _"], ...]:
         return tuple(
-            jnp.sqrt(self.objective.weights[k]) * self.objective.terms[k].residual(kin).reshape(signals.shape[0], -1)  # type: ignore
+            jnp.sqrt(self.objective.weights[k]) * self.objective.terms[k].residual(kin).reshape(len(self.fixed), -1)  # type: ignore
             for k in self.terms
         )
 
@@ -174,6 +183,30 @@ class _PointRows(eqx.Module):
 
     def __call__(self, points: tuple[Array, ...]) -> tuple[Array, ...]:
         return self.rows((_signals(self.controls, points),))
+
+    def linearised(self, points: tuple[Array, ...]) -> tuple[tuple[Array, ...], Callable]:
+        """The rows, and the function that gives their tangent for one of the points.
+
+        However far the rows look, the kinematics of a frame depend on the signals of that frame only: what a product
+        costs is the rows, and not one more pass through the kinematics.
+        """
+        signals = (_signals(self.controls, points),)
+
+        def parts(kin):
+            return kin.positions_world, kin.rotations_world, kin.rotations_parent, kin.signals
+
+        kin = self.rows.kinematics(signals)
+        moved, by_signal = _columns_of_signals(signals, lambda x: parts(self.rows.kinematics(x)))
+
+        def rows(moved):
+            return self.rows.of(eqx.tree_at(parts, kin, moved))
+
+        def product(t_points):
+            _, t_signals = jax.jvp(lambda p: _signals(self.controls, p), (points,), (t_points,))
+            t_moved = jax.tree.map(lambda c: jnp.einsum("tc,ct...->t...", t_signals, c), by_signal)
+            return jax.jvp(rows, (moved,), (t_moved,))[1]
+
+        return rows(moved), product
 
 
 def _signals(controls: tuple[Control, ...], points: tuple[Array, ...]) -> Float[Array, "frames controls"]:
@@ -258,7 +291,8 @@ def solve_block(work: Work, solver, max_steps: int, adjoint: optx.AbstractAdjoin
         signals = (_signals(controls, x),)
         far = _PointRows(controls, _Rows(objective, fixed, free, other))
         rows = (_with_columns(signals, _Rows(objective, fixed, free, local), _columns_of_signals, _times_signals),
-                far(x) if banded is None else _with_columns(x, far, banded.columns_of, banded.times))  # fmt: skip
+                far(x) if banded is None
+                else _with_columns(x, far, jax.tree_util.Partial(_columns_of_points, banded), banded.times))  # fmt: skip
         costs = {k: 0.5 * jnp.sum(jnp.square(r)) for k, r in zip(local + other, rows[0] + rows[1], strict=True)}
         return tuple(joined(r, len(fixed)) for r in rows), tuple(costs[k] for k in terms)
 

@@ -104,18 +104,18 @@ class Banded(lx.AbstractLinearSolver):
         tree = jax.tree.unflatten(jax.tree.structure(unknowns), [seeds[:, c] for c in range(controls)])
         return jax.tree.leaves(jax.vmap(operator.mv)(tree))
 
-    def columns_of(self, x: tuple[Array, ...], fn: Callable) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-        """Rows fn(x) of the control points x, (frames, n) each, and all of their Jacobian that is not zero, by control
-        and colour: (controls * width, frames, n)."""
+    def columns_of(self, x: tuple[Array, ...], product: Callable) -> tuple[Array, ...]:
+        """All that is not zero of the Jacobian of rows (frames, n), by control and colour: (controls * width, frames, n)
+        each. `product` gives the rows' tangent for one of the control points x."""
         seeds = _seeds(len(x), len(x[0]), self.width, x[0].dtype)
         # as many products at once as memory bears: for a long clip one or a few
         parts = [p for p in range(1, len(seeds) + 1) if len(seeds) % p == 0]
         part = max((p for p in parts if p * len(self.first) <= FRAMES_AT_ONCE), default=1)
-        product = jax.vmap(lambda seed: jax.jvp(fn, (x,), ((*seed,),)), out_axes=(None, 0))
+        products = jax.vmap(lambda seed: product((*seed,)))
         if part == len(seeds):
-            return product(seeds)
-        value, columns = jax.lax.map(product, seeds.reshape(-1, part, *seeds.shape[1:]))
-        return jax.tree.map(lambda v: v[0], value), jax.tree.map(lambda c: c.reshape(-1, *c.shape[2:]), columns)
+            return products(seeds)
+        columns = jax.lax.map(products, seeds.reshape(-1, part, *seeds.shape[1:]))
+        return jax.tree.map(lambda c: c.reshape(-1, *c.shape[2:]), columns)
 
     def times(self, columns: tuple[Array, ...], x: tuple[Array, ...]) -> tuple[Array, ...]:
         """The product of such a Jacobian with control points."""

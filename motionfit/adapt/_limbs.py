@@ -33,6 +33,7 @@ SOLVE_PROBES = {"upper_arm": 20, "forearm": 16, "hand": 12, "thigh": 20, "calf":
 # too, and a body that leans and comes down to balance brings its thighs some 2 mm nearer
 ALLOWED_EXCESS = 0.002
 MARGIN = 0.001  # [m]
+DOUBTED = 0.02  # [m] on the fields of a shoulder that shows nothing on the skin
 LEAST_GAP = 0.005  # [m]
 # Across and twist are there for what r alone cannot do, and the skin around a shoulder is known least where it twists
 SIGMA_EFFORT = {
@@ -137,19 +138,19 @@ def limbs(
     own = reference_depths(source, character, reference, pairs, objective)
     before = volume_depths(everything, small)
     excess = before - own
-    # a pair that shows no violation is left alone; near the shoulder the skin alone knows
-    slack = np.where([p.first.endswith("upper_arm") for p in pairs], np.inf, 1.0)
+    most, kept = excess.max(axis=0), own + allowance(excess, ALLOWED_EXCESS, MARGIN)
+    quiet = most <= TOLERANCE  # a pair that shows no violation is left alone
     looks = None
-    if reference is None or objective != "vertex":
-        quiet = excess.max(axis=0) <= TOLERANCE
-    else:
+    if reference is not None and objective == "vertex":
         looks = SkinLooks(source, character, reference, pairs)
         # the frames that were looked at when an adapted clip was made
         first = volume_depths(everything, onto(source, character.skeleton)) - own if known else excess
         looks.look_closer(first.max(axis=1))
-        quiet = excess.max(axis=0) <= slack * TOLERANCE
-        quiet &= looks.quiet(looks.depths(small))
-    kept = own + allowance(excess, ALLOWED_EXCESS, MARGIN)
+        clear = looks.quiet(looks.depths(small))
+        # near the shoulder the skin alone knows; of a little more on the fields the part over the tolerance may go
+        phantom = clear & ~quiet & np.array([p.first.endswith("upper_arm") for p in pairs])
+        quiet = (clear & quiet) | (phantom & (most > DOUBTED))
+        kept = np.where(phantom, own + ENOUGH * TOLERANCE - MARGIN, kept)
     if start is not None:
         _check_start(start, seen, pairs)
     allowed = np.where(quiet, np.maximum(before, own), kept)
