@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from motionfit._character import PARTS, Character
 from motionfit._control import Correction
 from motionfit._fit import Block, Fit, fit
-from motionfit._motion import Motion, bind_pose
+from motionfit._motion import Motion, bind_pose, joint_angles
 from motionfit._onto import onto
 from motionfit._problem import During, Problem, Robust
 from motionfit._skeleton import SIDES
@@ -23,11 +23,12 @@ from motionfit._types import InputError
 from motionfit.adapt._clearance import Clearance, all_rows, counted_probes, kept_with, reduced, support
 from motionfit.adapt._controls import Turn, turn_controls
 from motionfit.adapt._limbs import jerk_scale, smooth_floor
+from motionfit.adapt._limits import NEARLY, SkinLooks
 from motionfit.adapt._record import recorded
 from motionfit.adapt._sampling import Sampling, sampling
 from motionfit.metrics import TOLERANCE, derivative_ratio
 from motionfit.shape.field import Probes, fit_field
-from motionfit.shape.pairs import Pair
+from motionfit.shape.pairs import PAIRS, Pair
 from motionfit.terms.penetration import SkinClearance, SkinContact
 from motionfit.terms.pose import Effort, Smoothness
 
@@ -38,6 +39,7 @@ EASE = 0.08  # [s] within which a touch is taken up and let go
 EFFORT = 0.5  # [rad]
 MOST_JERK = 1.04
 ROUNDS = 4
+HALVINGS = 6  # of what sinks in on the skin
 PROBES = {"upper_arm": 20, "forearm": 16, "hand": 16}
 
 
@@ -200,7 +202,7 @@ def _solve(
     score = support(known.clearance, small, limit)
     seen = dataclasses.replace(motion[at.rows], dt=np.asarray(at.dt))
     smooth, history = jerk_scale(motion), []
-    tries = [(_faults(worst, np.where(touching, -before - TOUCH, 0.0)), so_far, before)]
+    tries = [(_faults(worst, np.where(touching, -before - TOUCH, 0.0)), so_far, before, points)]
     by_field = [[i for i, owner in enumerate(known.clearance.term.field_of) if owner == k]  # pyright: ignore[reportAttributeAccessIssue]
                 for k in range(len(known.clearance.term.fields))]  # fmt: skip  # pyright: ignore[reportAttributeAccessIssue]
     for _ in range(ROUNDS):
@@ -222,7 +224,7 @@ def _solve(
         apart = np.where(touching, -after - TOUCH, 0.0)
         jerk = derivative_ratio(result.motion, motion, 3) or 1.0
         if jerk <= MOST_JERK + 0.01:
-            tries.append((_faults(over, apart), result, after))
+            tries.append((_faults(over, apart), result, after, points))
         if over.max() <= 0.7 * TOLERANCE and apart.max() <= 0.0 and jerk <= MOST_JERK:
             break
         if jerk > MOST_JERK:
@@ -231,11 +233,40 @@ def _solve(
         gap = gap - np.where(apart > 0.0, np.minimum(apart + 0.003, 0.01), 0.0)
         score = np.maximum(score, support(known.clearance, moved, limit))
     # a touch that cannot be had without sinking in elsewhere is given up, and so is all that makes matters worse
-    _, result, after = min(tries, key=lambda t: t[0])
+    _, result, after, points = min(tries, key=lambda t: t[0])
+    if reference is not None and result is not so_far:
+        mine = Correction(controls, points.points)
+        result = _as_far_as_skin_allows(clip, character, reference, so_far, mine, at, groups[0].spacing / 60.0)
+        after = known.depths(at.motion(result.motion))
     told = _told(pairs, before, after, limit, touching, inner)
     left = np.where(inner, 0.0, after - limit).max() > TOLERANCE
     return dataclasses.replace(result, history=(*so_far.history, *history),
                                status="violations_left" if left else so_far.status), told  # fmt: skip
+
+
+def _as_far_as_skin_allows(
+    clip: Motion, character: Character, reference: Character, so_far: Fit, mine: Correction, at: Sampling,
+    spacing: float,
+) -> Fit:  # fmt: skip
+    """A fit with more controls on top, and less of them around the frames where they sink in an arm or leg that was
+    out: at a shoulder the fields, which the controls were solved by, do not know the skin."""
+    looks, small = SkinLooks(clip[at.frames], character, reference, PAIRS), at.motion(so_far.motion)
+    looks.look_closer(joint_angles(at.motion(on_top(so_far, mine, at).motion), small).max(axis=1))
+    most = np.maximum(looks.depths(small) - looks.own, NEARLY * TOLERANCE)
+    share = np.ones(at.basis.count)
+    width = EASE / spacing  # [knots]
+    for _ in range(HALVINGS):
+        less = dataclasses.replace(mine, points=tuple(share * np.asarray(p) for p in mine.points))
+        result = on_top(so_far, less, at)
+        sunk = (looks.depths(at.motion(result.motion)) - looks.own > most).any(axis=1)
+        jerk = derivative_ratio(result.motion, so_far.motion, 3) or 1.0
+        if not sunk.any() and jerk <= MOST_JERK + 0.01:
+            return result
+        around = np.zeros(at.basis.count)
+        around[np.asarray(at.basis.first)[looks.at[sunk]][:, None] + np.arange(4)] = 1.0
+        around = gaussian_filter1d(maximum_filter1d(around, 2 * round(2 * width) + 1), width)
+        share = share * (1.0 - 0.5 * around) if sunk.any() else 0.5 * share
+    return so_far
 
 
 def _faults(over: Float[np.ndarray, "frames rows"], apart: Float[np.ndarray, "frames rows"]) -> float:
