@@ -5,11 +5,11 @@ moment: a hand at the head, on the other arm, across the belly. And where a hand
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from motionfit._character import PARTS, Character
@@ -39,7 +39,7 @@ EASE = 0.08  # [s] within which a touch is taken up and let go
 EFFORT = 0.5  # [rad]
 MOST_JERK = 1.04
 ROUNDS = 4
-HALVINGS = 6  # of what sinks in on the skin
+HALVINGS = 6  # of what sinks in
 PROBES = {"upper_arm": 20, "forearm": 16, "hand": 16}
 
 
@@ -234,9 +234,9 @@ def _solve(
         score = np.maximum(score, support(known.clearance, moved, limit))
     # a touch that cannot be had without sinking in elsewhere is given up, and so is all that makes matters worse
     _, result, after, points = min(tries, key=lambda t: t[0])
-    if reference is not None and result is not so_far:
-        mine = Correction(controls, points.points)
-        result = _as_far_as_skin_allows(clip, character, reference, so_far, mine, at, groups[0].spacing / 60.0)
+    if result is not so_far:
+        sunk = sinking_skin(clip, character, reference, so_far, result, at)
+        result = eased(so_far, Correction(controls, points.points), at, groups[0].spacing / 60.0, sunk)
         after = known.depths(at.motion(result.motion))
     told = _told(pairs, before, after, limit, touching, inner)
     left = np.where(inner, 0.0, after - limit).max() > TOLERANCE
@@ -244,28 +244,43 @@ def _solve(
                                status="violations_left" if left else so_far.status), told  # fmt: skip
 
 
-def _as_far_as_skin_allows(
-    clip: Motion, character: Character, reference: Character, so_far: Fit, mine: Correction, at: Sampling,
-    spacing: float,
-) -> Fit:  # fmt: skip
-    """A fit with more controls on top, and less of them around the frames where they sink in an arm or leg that was
-    out: at a shoulder the fields, which the controls were solved by, do not know the skin."""
-    looks, small = SkinLooks(clip[at.frames], character, reference, PAIRS), at.motion(so_far.motion)
-    looks.look_closer(joint_angles(at.motion(on_top(so_far, mine, at).motion), small).max(axis=1))
+def sinking_skin(
+    clip: Motion, character: Character, reference: Character | None, so_far: Fit, whole: Fit, at: Sampling
+):
+    """Says of a fit between `so_far` and `whole` in which of the frames that are seen an arm or leg sinks in that was
+    out: at a shoulder the fields, which controls are solved by, do not know the skin. Nothing without a reference."""
+    small = at.motion(so_far.motion)
+    if reference is None:
+        return lambda fit: np.zeros(small.frame_count, bool)
+    looks = SkinLooks(clip[at.frames], character, reference, PAIRS)
+    looks.look_closer(joint_angles(at.motion(whole.motion), small).max(axis=1))
     most = np.maximum(looks.depths(small) - looks.own, NEARLY * TOLERANCE)
-    share = np.ones(at.basis.count)
-    width = EASE / spacing  # [knots]
+
+    def sunk(fit: Fit) -> Bool[np.ndarray, " seen"]:
+        result = np.zeros(small.frame_count, bool)
+        result[looks.at] = (looks.depths(at.motion(fit.motion)) - looks.own > most).any(axis=1)
+        return result
+
+    return sunk
+
+
+def eased(
+    so_far: Fit, mine: Correction, at: Sampling, spacing: float, sunk: Callable[[Fit], Bool[np.ndarray, " seen"]]
+) -> Fit:
+    """A fit with more controls on top, of knots every `spacing` [s], and less and less of them around the frames that
+    show something `sunk`."""
+    share, width = np.ones(at.basis.count), EASE / spacing
     for _ in range(HALVINGS):
-        less = dataclasses.replace(mine, points=tuple(share * np.asarray(p) for p in mine.points))
+        less = dataclasses.replace(mine, points=tuple(share * np.asarray(p)[: len(share)] for p in mine.points))
         result = on_top(so_far, less, at)
-        sunk = (looks.depths(at.motion(result.motion)) - looks.own > most).any(axis=1)
+        where = sunk(result)
         jerk = derivative_ratio(result.motion, so_far.motion, 3) or 1.0
-        if not sunk.any() and jerk <= MOST_JERK + 0.01:
+        if not where.any() and jerk <= MOST_JERK + 0.01:
             return result
         around = np.zeros(at.basis.count)
-        around[np.asarray(at.basis.first)[looks.at[sunk]][:, None] + np.arange(4)] = 1.0
+        around[np.asarray(at.basis.first)[np.flatnonzero(where)][:, None] + np.arange(4)] = 1.0
         around = gaussian_filter1d(maximum_filter1d(around, 2 * round(2 * width) + 1), width)
-        share = share * (1.0 - 0.5 * around) if sunk.any() else 0.5 * share
+        share = share * (1.0 - 0.5 * around) if where.any() else 0.5 * share
     return so_far
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from motionfit._character import Character
@@ -17,11 +17,11 @@ from motionfit._problem import During, Problem
 from motionfit._programs import program
 from motionfit._skeleton import SIDES
 from motionfit.adapt._clearance import reduced, support
-from motionfit.adapt._collisions import Group, filled, known_depths, on_top
+from motionfit.adapt._collisions import Group, eased, filled, known_depths, on_top, sinking_skin
 from motionfit.adapt._controls import Turn, turn_controls
 from motionfit.adapt._limbs import SOLVE_PROBES, jerk_scale, smooth_floor
 from motionfit.adapt._record import recorded
-from motionfit.adapt._sampling import sampling
+from motionfit.adapt._sampling import KNOT_SPACING, sampling
 from motionfit.metrics import TOLERANCE, derivative_ratio
 from motionfit.terms.pose import Direction, Effort, Smoothness
 
@@ -87,7 +87,6 @@ def _side(clip: Motion, character: Character, so_far: Fit, reference: Character 
     seen = dataclasses.replace(motion[at.rows], dt=np.asarray(at.dt))
     points = Correction.zero(tuple(at.control(c) for c in controls))
     names, smooth, history = tuple(c.name for c in controls), jerk_scale(motion), []
-    best = (told["error_before_rad"], so_far)
     for attempt in range(ROUNDS):
         free = filled(smooth_floor(allowed, at.dt), at, 1e3)
         terms = {"direction": During(Direction((elbow,), (hand,), target[at.rows]), real.astype(float)),
@@ -104,15 +103,23 @@ def _side(clip: Motion, character: Character, so_far: Fit, reference: Character 
         after = clear.depths(at.motion(result.motion))
         over = after - np.maximum(limit, before)
         jerk = derivative_ratio(result.motion, motion, 3) or 1.0
-        if over.max() <= TOLERANCE and jerk <= MOST_JERK + 0.01 and error(result.motion) < best[0]:
-            best = (error(result.motion), result)
         if over.max() <= 0.7 * TOLERANCE and jerk <= MOST_JERK:
             break
         if jerk > MOST_JERK:
             smooth *= 0.4
         allowed = allowed - np.where(over > 0.7 * TOLERANCE, np.minimum(over, 0.02), 0.0)
         score = np.maximum(score, support(clear.clearance, at.motion(result.motion), limit))
-    told["error_after_rad"], result = best
+    # where a forearm cannot point there without sinking in, it comes back in the other frames
+    on_skin = sinking_skin(clip, character, reference, so_far, result, at)
+
+    def sunk(fit: Fit) -> Bool[np.ndarray, " seen"]:
+        after = clear.depths(at.motion(fit.motion))
+        return (after - np.maximum(limit, before) > TOLERANCE).any(axis=1) | on_skin(fit)
+
+    result = eased(so_far, Correction(controls, points.points), at, KNOT_SPACING, sunk)
+    told["error_after_rad"] = error(result.motion)
+    if told["error_after_rad"] > told["error_before_rad"]:
+        result, told["error_after_rad"] = so_far, told["error_before_rad"]
     return dataclasses.replace(result, history=(*so_far.history, *history)), told
 
 
