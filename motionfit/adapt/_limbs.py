@@ -52,6 +52,7 @@ WIDE = np.deg2rad(45.0)  # a turn that makes one look for a shorter way out
 STARTS = tuple(np.deg2rad(s) for s in ((30.0, 0.0, 0.0), (30.0, 30.0, 30.0), (30.0, -30.0, -30.0)))
 ROUNDS, PATIENCE = 9, 2  # rounds at most, and rounds without a better result
 FEW_FAULTS = 0.005
+DONE = 0.5  # of what the source shows on a body: what a block leaves at most that has done its work
 LESS = 0.8  # of the mean square of all turns: a tenth of the turns themselves
 CLOSER = (0, 1)  # rounds after which more frames are looked at
 
@@ -215,8 +216,10 @@ def limbs(
             # the solver sees some probes only, and its corrections are smooth: what they left is taken off
             more = np.where(left > ENOUGH * TOLERANCE, after - used, 0.0)
             stages = [_tighten(s, more[:, s.columns], float(small.dt)) for s in stages]
-    if looks is not None and best.left > TOLERANCE:
-        best = best._replace(correction=_unless_worse(best.correction, looks, stages, base, seen, controls, whole))
+    if looks is not None and (best.left > TOLERANCE or known):
+        first = onto(source, character.skeleton) if known else None
+        worth = _worth_it(best.correction, looks, stages, base, first, seen, controls, whole)
+        best = best._replace(correction=worth)
         moved = _final(controls, whole, best.correction).apply(base)[seen.frames]
         after = volume_depths(everything, moved)
         best = best._replace(
@@ -250,16 +253,21 @@ def _from_elsewhere(problem: Problem, result: Fit, stages: list[Stage]) -> Fit:
     return result
 
 
-def _unless_worse(
-    correction: Correction, looks: SkinLooks, stages: list[Stage], base: Motion, seen: Seen,
+def _worth_it(
+    correction: Correction, looks: SkinLooks, stages: list[Stage], base: Motion, first: Motion | None, seen: Seen,
     controls: tuple[Control, ...], whole: Basis,
 ) -> Correction:  # fmt: skip
     """A correction without the blocks that leave their pairs deeper in each other, on the skin, than they were: where
-    the fields see what is not there, the clip is better left alone."""
+    the fields see what is not there, the clip is better left alone. Of a clip that was adapted from `first` also
+    without those that had done their work: what is still there then is what they could not take out."""
     moved = _final(controls, whole, correction).apply(base)
-    shown, before = (looks.depths(m[seen.frames]) - looks.own for m in (moved, base))
-    worse = [s.block.controls for s in stages if 0.0 < _amount(shown[:, s.columns]) >= _amount(before[:, s.columns])]
-    names = {name for block in worse for name in block}
+    now, was = (looks.depths(m[seen.frames]) - looks.own for m in (moved, base))
+    once = was if first is None else looks.depths(first) - looks.own
+    names = set()
+    for stage in stages:
+        is_now, before, at_first = (_amount(excess[:, stage.columns]) for excess in (now, was, once))
+        if 0.0 < is_now >= before or (first is not None and before <= DONE * at_first):
+            names |= set(stage.block.controls)
     points = tuple(
         np.zeros(np.shape(p)) if c.name in names else p
         for c, p in zip(correction.controls, correction.points, strict=True)
