@@ -1,11 +1,13 @@
 """Whole adaptations, judged on the volumes and on the skin."""
 
+import dataclasses
 import json
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import motionfit as mf
 from benchmarks.metrics import compilations
@@ -55,6 +57,29 @@ def test_adapting_again_changes_nearly_nothing(ending, fitted, heavy, average, t
     again = mf.adapt(adapted, heavy, reference=average)
     assert joint_angles(again.motion, fitted.motion).max() < np.deg2rad(0.1)
     assert np.abs(np.asarray(again.motion.root) - np.asarray(fitted.motion.root)).max() < 1e-4
+
+
+def test_a_block_that_did_its_work_rests_and_another_works(heavy, average):
+    """Though the left arm of the adapted clip still sinks in for a moment, by a part of what the source shows."""
+    walk = samples.walk(cycles=2)
+    arms = mf.adapt(walk, heavy, reference=average, blocks=("arms",))
+    moment = 0.6 * np.exp(-(((np.arange(walk.frame_count) - 40) / 6.0) ** 2))
+    joint = heavy.skeleton.joint("left_upper_arm")
+    out, still = (
+        Rotation.from_quat(np.asarray(m.rotations)[:, joint], scalar_first=True) for m in (arms.motion, arms.base)
+    )
+    rotations = np.array(arms.motion.rotations, float)
+    rotations[:, joint] = (Rotation.from_rotvec(moment[:, None] * (still * out.inv()).as_rotvec()) * out).as_quat(
+        scalar_first=True
+    )
+    adapted = dataclasses.replace(arms.motion, rotations=rotations)
+    assert 0.0 < _over(heavy, adapted, average, walk)[0] < 0.3
+
+    again = mf.adapt(adapted, heavy, reference=average, blocks=("arms", "legs"))
+    turned = joint_angles(again.motion, adapted).max(axis=0)
+    legs = [heavy.skeleton.joint(f"{s}_thigh") for s in ("left", "right")]
+    assert turned[joint] < 1e-6 and turned[legs].min() > np.deg2rad(1.0)
+    assert again.status == "violations_left"
 
 
 def test_only_the_source_tells_an_adapted_clip_from_one_to_adapt(fitted, heavy, average):
@@ -188,3 +213,14 @@ def test_what_the_skin_never_showed_is_not_made_worse(shared_data):
     before, after = (skin_depths(dancer, m, step=20).depth - own for m in (fit.base, fit.motion))
     assert before.max() < 0.01
     assert after.max() < 0.01
+
+
+def test_an_arm_that_turns_anyway_loses_what_its_shoulder_shows_on_the_fields_alone(shared_data):
+    clip = mf.load_motion(shared_data / "locomotion" / "walk_16_15.bvh")
+    dancer, reference = (mf.load_character(shared_data / "characters" / f"{n}.glb")
+                         for n in ("athletic_female", "avg_male"))  # fmt: skip
+    fit = mf.adapt(clip, dancer, reference=reference, blocks=("arms",))
+    shoulder = fit.details["pairs"].index("right_upper_arm/torso")
+    assert fit.details["excess_before_m"][:, shoulder].max() > 0.014
+    assert fit.details["excess_after_m"].max() <= 0.01
+    assert joint_angles(fit.motion, fit.base).mean() < np.deg2rad(0.5)

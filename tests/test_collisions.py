@@ -13,9 +13,12 @@ from motionfit import samples
 from motionfit._character import PARTS
 from motionfit._control import Correction
 from motionfit._fit import block_adjoint, block_solver, block_work, solve_block
-from motionfit._motion import Motion, host_kinematics, rest_motion
+from motionfit._motion import Motion, host_kinematics, joint_angles, rest_motion
 from motionfit.adapt import Group, Sphere, Turn, multi_start
-from motionfit.adapt._collisions import GROUPS, known_depths
+from motionfit.adapt._collisions import GROUPS, eased, known_depths, on_top, sinking_skin
+from motionfit.adapt._controls import turn_controls
+from motionfit.adapt._sampling import sampling
+from motionfit.metrics import skin_depths
 from motionfit.splines import bspline_basis
 from motionfit.terms import Direction, SkinContact
 from tests.helpers import central_difference, random_motion
@@ -57,6 +60,25 @@ def test_a_hand_comes_out_of_the_thigh(sunk, average):
     moved = np.abs(host_kinematics(fit.motion)[0] - host_kinematics(bad)[0]).max(axis=(1, 2))
     assert moved[-1] < 0.005 < moved[25]
     np.testing.assert_allclose(fit.correction.apply(fit.base).rotations, fit.motion.rotations, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_what_sinks_in_on_the_skin_gives_way_there_and_nowhere_else(average):
+    base = mf.onto(samples.walk(cycles=2), average.skeleton)
+    at, turn = sampling(base, 2 / 60), Turn("arm_out", (("left_upper_arm", "forward", 1.0),))
+    controls = turn_controls(base, at.whole, [turn])
+    time = np.arange(at.basis.count) / (at.whole.count - 1)
+    in_then_out = 0.3 * (np.exp(-(((time - 0.75) / 0.1) ** 2)) - np.exp(-(((time - 0.25) / 0.1) ** 2)))
+    mine, so_far = Correction(controls, (in_then_out,)), _as_fit(base, base, average)
+    whole = on_top(so_far, mine, at)
+    result = eased(so_far, mine, at, 2 / 60, sinking_skin(base, average, average, so_far, whole, at))
+
+    own = skin_depths(average, base, step=2).depth
+    excess = [(skin_depths(average, fit.motion, step=2).depth - own).max() for fit in (whole, result)]
+    assert excess[0] > 0.02 and excess[1] < 0.011
+    quarter = base.frame_count // 4
+    turned, asked = (joint_angles(fit.motion, base).max(axis=1)[[quarter, 3 * quarter]] for fit in (result, whole))
+    assert asked.min() > 0.25 and turned[0] < 0.7 * asked[0] and turned[1] > 0.99 * asked[1]
 
 
 def test_a_clip_without_collisions_comes_back(sunk, average):

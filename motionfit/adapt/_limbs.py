@@ -148,9 +148,13 @@ def limbs(
         first = volume_depths(everything, onto(source, character.skeleton)) - own if known else excess
         looks.look_closer(first.max(axis=1))
         clear = looks.quiet(looks.depths(small))
-        # near the shoulder the skin alone knows; of a little more on the fields the part over the tolerance may go
+        # near the shoulder the skin alone knows; but where the arm has to turn anyway, and the fields show a little more
+        # than the tolerance, they lose that too
         phantom = clear & ~quiet & np.array([p.first.endswith("upper_arm") for p in pairs])
-        quiet = (clear & quiet) | (phantom & (most > DOUBTED))
+        quiet = (clear & quiet) | phantom
+        arm_of = np.array([p.first.partition("_")[0] if p.block == "arms" else p.block for p in pairs])
+        phantom &= (most <= DOUBTED) & np.isin(arm_of, arm_of[~quiet])
+        quiet &= ~phantom
         kept = np.where(phantom, own + ENOUGH * TOLERANCE - MARGIN, kept)
     if start is not None:
         _check_start(start, seen, pairs)
