@@ -192,6 +192,7 @@ def test_forearms_point_where_they_did(heavy, average):
     fit = mf.adapt.forearm(walk, heavy, arms, reference=average, hand=True)
     before, after = (mf.metrics.forearm_direction(f.motion, arms.base) for f in (arms, fit))
     assert before is not None and after is not None and after < 0.5 * before
+    assert fit.motion.source is arms.motion.source is not None
     limit = np.maximum(arms.details["excess_after_m"], 0).max()
     pairs = tuple(p for p in mf.shape.PAIRS if p.name in arms.details["pairs"])
     own = mf.adapt.reference_depths(walk, heavy, average, pairs)

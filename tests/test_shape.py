@@ -27,7 +27,7 @@ from motionfit.shape.field import (
     standing,
     standing_vertices,
 )
-from motionfit.shape.surface import inside_depths, part_surface
+from motionfit.shape.surface import inside_depths, may_be_inside, part_surface
 from motionfit.shape.volumes import fit_volumes
 from tests.helpers import central_difference
 
@@ -214,3 +214,19 @@ def test_girth_texts():
     for wrong in ("arms", "arms=x", "", "=2"):
         with pytest.raises(mf.InputError, match="arms=1.3"):
             parse_girth(wrong)
+
+
+def test_a_point_inside_between_two_slices_is_asked_about():
+    """Of a spindle of eleven rings, seven slices: under the widest ring, in the slice below it, it is wider than any
+    ring of that slice."""
+    heights, angles = np.linspace(-0.5, 0.5, 11), np.linspace(0.0, 2 * np.pi, 16, endpoint=False)
+    radii = 0.501 - np.abs(heights)
+    ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    vertices = np.concatenate(
+        [np.column_stack([r * ring, np.full(16, h)]) for r, h in zip(radii, heights, strict=True)]
+    )
+    spindle = trimesh.convex.convex_hull(vertices)
+    points = np.array([[0.42, 0.0, -0.075], [0.43, 0.0, -0.075], [0.0, 0.0, 0.0]])
+    may = may_be_inside(points, spindle.vertices, np.asarray(spindle.faces))
+    depth = inside_depths(points, np.asarray(spindle.vertices), np.asarray(spindle.faces, np.int64))
+    assert may[0] and may[2] and (depth > 0).tolist() == [True, False, True]

@@ -21,7 +21,7 @@ from motionfit._types import InputError
 from motionfit.adapt._clearance import build_clearance, volume_depths
 from motionfit.adapt._controls import lean_controls
 from motionfit.adapt._limits import NEARLY, reference_depths
-from motionfit.adapt._record import recorded
+from motionfit.adapt._record import put_down
 from motionfit.adapt._sampling import Sampling, sampling
 from motionfit.adapt._standing import distances, weighed
 from motionfit.balance import WINDOW, Soles, ZmpDistance
@@ -233,8 +233,7 @@ def _stood(
     base = dataclasses.replace(so_far.base, root=root)
     both = Correction((*so_far.correction.controls, *mine.controls), (*so_far.correction.points, *mine.points))
     joints = sorted({int(d.joint) for c in controls for d in c.drives} | {j for leg in legs for j in leg.joints})
-    whole = recorded("stand", result, base, both, joints)
-    return dataclasses.replace(so_far, correction=whole, motion=whole.apply(base), base=base)
+    return put_down("stand", so_far, result, base, both, joints)
 
 
 def _down(legs: list[Leg], before: list[Leg], dt: float) -> Float[np.ndarray, "frames 3"]:

@@ -24,7 +24,7 @@ from motionfit.adapt._clearance import Clearance, all_rows, counted_probes, kept
 from motionfit.adapt._controls import Turn, turn_controls
 from motionfit.adapt._limbs import jerk_scale, smooth_floor
 from motionfit.adapt._limits import NEARLY, SkinLooks
-from motionfit.adapt._record import recorded
+from motionfit.adapt._record import put_down
 from motionfit.adapt._sampling import Sampling, sampling
 from motionfit.metrics import TOLERANCE, derivative_ratio
 from motionfit.shape.field import Probes, fit_field
@@ -297,8 +297,7 @@ def on_top(so_far: Fit, mine: Correction, at: Sampling) -> Fit:
     base = dataclasses.replace(so_far.base, root=so_far.motion.root)
     joints = sorted({int(d.joint) for c in mine.controls for d in c.drives})
     name = mine.controls[0].name
-    whole = recorded(name, motion, base, both, joints)
-    return dataclasses.replace(so_far, correction=whole, motion=whole.apply(base), base=base)
+    return put_down(name, so_far, motion, base, both, joints)
 
 
 def filled(rows: np.ndarray, at: Sampling, value: float) -> np.ndarray:

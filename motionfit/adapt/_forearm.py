@@ -20,7 +20,7 @@ from motionfit.adapt._clearance import reduced, support
 from motionfit.adapt._collisions import Group, eased, filled, known_depths, on_top, sinking_skin
 from motionfit.adapt._controls import Turn, turn_controls
 from motionfit.adapt._limbs import SOLVE_PROBES, jerk_scale, smooth_floor
-from motionfit.adapt._record import recorded
+from motionfit.adapt._record import put_down
 from motionfit.adapt._sampling import KNOT_SPACING, sampling
 from motionfit.metrics import TOLERANCE, derivative_ratio
 from motionfit.terms.pose import Direction, Effort, Smoothness
@@ -182,6 +182,5 @@ def _hands_back(fit: Fit) -> Fit:
                          for w, j in ((before, joint), (after, skeleton.parents[joint])))  # fmt: skip
         local[:, joint] = (above.inv() * wanted).as_quat(scalar_first=True)
     turned = dataclasses.replace(motion, rotations=local)
-    whole = recorded("hand_kept", turned, dataclasses.replace(fit.base, root=motion.root), fit.correction, joints)
     base = dataclasses.replace(fit.base, root=motion.root)
-    return dataclasses.replace(fit, correction=whole, motion=whole.apply(base), base=base)
+    return put_down("hand_kept", fit, turned, base, fit.correction, joints)

@@ -1,11 +1,13 @@
 """Write down what a closed form did to a motion, as controls with a value per frame."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from motionfit._control import Control, Correction, Drive
+from motionfit._fit import Fit
 from motionfit._motion import Motion
 from motionfit.splines import per_frame
 
@@ -32,3 +34,12 @@ def recorded(name: str, motion: Motion, base: Motion, correction: Correction, jo
         controls.append(Control(label, (Drive(joint, axis, 1.0),), basis, -np.pi, np.pi))
         points.append(np.concatenate([angle, np.zeros(basis.count - len(angle))]))
     return Correction(tuple(controls), tuple(points))
+
+
+def put_down(
+    name: str, so_far: Fit, motion: Motion, base: Motion, correction: Correction, joints: Sequence[int]
+) -> Fit:  # fmt: skip
+    """`so_far` with the rotations of `motion`, `recorded` on another `base`; what the clip was made from stays known."""
+    whole = recorded(name, motion, base, correction, joints)
+    moved = dataclasses.replace(whole.apply(base), source=so_far.motion.source)
+    return dataclasses.replace(so_far, correction=whole, motion=moved, base=base)
