@@ -108,6 +108,26 @@ def test_frame_local_rule_gives_the_same_jacobian(still):
     np.testing.assert_allclose(fast, jax.jacfwd(lambda s: rows((s,))[0])(signals), atol=1e-9)
 
 
+def test_rows_that_reach_over_frames_have_the_same_tangent(still):
+    """By the kinematics' columns against plain forward mode, for rows that read all that moves."""
+    from motionfit._fit import _PointRows, _Rows
+
+    def rows(kin, shift):
+        moved = shift + jnp.concatenate([x.reshape(len(x), -1) for x in (
+            kin.positions_world, kin.rotations_world, kin.rotations_parent, kin.signals)], axis=1)  # fmt: skip
+        return jnp.sin(moved[1:] * moved[:-1])[np.minimum(np.arange(20), 18)]
+
+    character, motion = still
+    controls = tuple(_control(character, motion, r) for r in ("left_upper_arm", "left_forearm"))
+    problem = mf.Problem(character, motion, {"t": mf.Custom(rows, 0.3, reach=1)}, controls)
+    far = _PointRows(controls, _Rows(problem.objective(), jnp.zeros((20, 2)), jnp.array([0, 1]), (0,)))
+    x, way = (tuple(jnp.asarray(np.random.default_rng(k).normal(size=(2, controls[0].basis.count)))) for k in (0, 1))
+    value, product = far.linearised(x)
+    exact, tangent = jax.jvp(far, (x,), (way,))
+    np.testing.assert_allclose(value[0], exact[0], atol=1e-12)
+    np.testing.assert_allclose(product(way)[0], tangent[0], atol=1e-9)
+
+
 def test_new_numbers_do_not_recompile(still):
     character, motion = still
     control = _control(character, motion, "left_upper_arm")
