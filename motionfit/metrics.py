@@ -16,7 +16,7 @@ from motionfit._programs import program
 from motionfit._skinning import skin_points
 from motionfit._types import AnyArray
 from motionfit.shape.pairs import PAIRS, Pair
-from motionfit.shape.surface import Inside, find_inside, inside_depths, part_surface
+from motionfit.shape.surface import Inside, find_inside, inside_depths, part_surface, surface_gap
 
 TOLERANCE = 0.01  # [m]: the "1 cm" of every frames_over_1cm
 
@@ -84,22 +84,40 @@ def insides(
     for direction in probed:
         by_surface.setdefault(direction[2], []).append(direction)
     surfaces = {part: part_surface(character, part) for part in by_surface}
+    for i, vertices in enumerate(posed_frames(character, motion)):
+        result = {}
+        for part, directions in by_surface.items():
+            asked = np.concatenate([probed[d] for d in directions])
+            mesh = surfaces[part]
+            found = find_inside(vertices[asked], vertices[mesh.used], mesh.triangles)
+            ends = np.searchsorted(found.points, np.cumsum([len(probed[d]) for d in directions]))
+            for direction, low, high in zip(directions, [0, *ends[:-1]], ends, strict=True):
+                own = Inside(*(x[low:high] for x in found))
+                result[direction] = own._replace(points=asked[own.points])
+        yield i, vertices, result
+
+
+def posed_frames(character: Character, motion: Motion) -> Iterator[Float[np.ndarray, "vertices 3"]]:
+    """World vertices [m] of the skin, frame after frame."""
     chunk = 16  # frames skinned at once: the whole clip would not fit for long clips
     for start in range(0, motion.frame_count, chunk):
         # always whole chunks, so that the skinning compiles once
         some = np.minimum(np.arange(start, start + chunk), motion.frame_count - 1)
-        posed = posed_vertices(character, motion[some]).astype(float)
-        for i in range(start, min(start + chunk, motion.frame_count)):
-            vertices, result = posed[i - start], {}
-            for part, directions in by_surface.items():
-                asked = np.concatenate([probed[d] for d in directions])
-                mesh = surfaces[part]
-                found = find_inside(vertices[asked], vertices[mesh.used], mesh.triangles)
-                ends = np.searchsorted(found.points, np.cumsum([len(probed[d]) for d in directions]))
-                for direction, low, high in zip(directions, [0, *ends[:-1]], ends, strict=True):
-                    own = Inside(*(x[low:high] for x in found))
-                    result[direction] = own._replace(points=asked[own.points])
-            yield i, vertices, result
+        yield from posed_vertices(character, motion[some]).astype(float)[: motion.frame_count - start]
+
+
+def skin_gaps(
+    character: Character, motion: Motion, pairs: Sequence[Pair], wanted: Bool[np.ndarray, "frames pairs"] | None = None
+) -> Float[np.ndarray, "frames pairs"]:
+    """How far [m] the skin of each pair's first part is from the second's surface: that of its nearest vertex, negative
+    where one is inside. NaN where it is not `wanted` (None: it is everywhere)."""
+    wanted = np.ones((motion.frame_count, len(pairs)), bool) if wanted is None else wanted
+    result, frames = np.full(wanted.shape, np.nan), np.flatnonzero(wanted.any(axis=1))
+    for t, vertices in zip(frames, posed_frames(character, motion[frames]), strict=True):
+        for k in np.flatnonzero(wanted[t]).tolist():
+            points, surface = (part_surface(character, part) for part in pairs[k][:2])
+            result[t, k] = surface_gap(vertices[points.vertices], vertices[surface.used], surface.triangles)
+    return result
 
 
 def _probed(character: Character, pairs: Sequence[Pair]) -> dict[Direction, Int[np.ndarray, " vertices"]]:

@@ -5,6 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
+from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 import motionfit as mf
@@ -15,10 +17,11 @@ from motionfit._control import Correction
 from motionfit._fit import block_adjoint, block_solver, block_work, solve_block
 from motionfit._motion import Motion, host_kinematics, joint_angles, rest_motion
 from motionfit.adapt import Group, Sphere, Turn, multi_start
-from motionfit.adapt._collisions import GROUPS, eased, known_depths, on_top, sinking_skin
+from motionfit.adapt._collisions import GROUPS, arm_turns, eased, known_depths, on_top, sinking_skin, skin_looks
 from motionfit.adapt._controls import turn_controls
 from motionfit.adapt._sampling import sampling
-from motionfit.metrics import skin_depths
+from motionfit.metrics import skin_depths, skin_gaps
+from motionfit.shape.pairs import Pair
 from motionfit.splines import bspline_basis
 from motionfit.terms import Direction, SkinContact
 from tests.helpers import central_difference, random_motion
@@ -70,8 +73,10 @@ def test_what_sinks_in_on_the_skin_gives_way_there_and_nowhere_else(average):
     time = np.arange(at.basis.count) / (at.whole.count - 1)
     in_then_out = 0.3 * (np.exp(-(((time - 0.75) / 0.1) ** 2)) - np.exp(-(((time - 0.25) / 0.1) ** 2)))
     mine, so_far = Correction(controls, (in_then_out,)), _as_fit(base, base, average)
-    whole = on_top(so_far, mine, at)
-    result = eased(so_far, mine, at, 2 / 60, sinking_skin(base, average, average, so_far, whole, at))
+    whole, looks, small = on_top(so_far, mine, at), skin_looks(base, average, average, at), at.motion(base)
+    assert looks is not None
+    looks.look_closer(joint_angles(at.motion(whole.motion), small).max(axis=1))
+    result = eased(so_far, mine, at, 2 / 60, sinking_skin(looks, small, at))
 
     own = skin_depths(average, base, step=2).depth
     excess = [(skin_depths(average, fit.motion, step=2).depth - own).max() for fit in (whole, result)]
@@ -79,6 +84,50 @@ def test_what_sinks_in_on_the_skin_gives_way_there_and_nowhere_else(average):
     quarter = base.frame_count // 4
     turned, asked = (joint_angles(fit.motion, base).max(axis=1)[[quarter, 3 * quarter]] for fit in (result, whole))
     assert asked.min() > 0.25 and turned[0] < 0.7 * asked[0] and turned[1] > 0.99 * asked[1]
+
+
+@pytest.mark.slow
+def test_a_hand_that_left_the_head_comes_back_to_it_and_nothing_sinks_in(average):
+    """The source touches the head; the arm was led out, as on a heavy body; on the skin the hand is back."""
+    skeleton, walk = average.skeleton, mf.onto(samples.walk(cycles=2)[:120], average.skeleton)
+    shoulder, elbow = (skeleton.joint(f"right_{part}") for part in ("upper_arm", "forearm"))
+
+    def posed(turns, share):
+        rotations = np.array(walk.rotations)
+        for joint, turn in ((shoulder, turns[:3]), (elbow, turns[3:])):
+            own = Rotation.from_quat(rotations[:, joint], scalar_first=True)
+            turned = Rotation.from_rotvec(share[:, None] * turn) * own
+            rotations[:, joint] = turned.as_quat(scalar_first=True)
+        return Motion(skeleton, walk.root, rotations, walk.dt)
+
+    touch = (Pair("right_hand", "head", ""),)
+    hand, head = skeleton.joint("right_hand"), skeleton.joint("head")
+
+    def far(x, exactly=True):
+        motion = posed(x, np.ones(120))[60:61]
+        if not exactly:
+            places = host_kinematics(motion)[0][0]
+            return abs(float(np.linalg.norm(places[hand] - places[head])) - 0.25)
+        beside = skin_depths(average, motion).depth.max()
+        return abs(float(skin_gaps(average, motion, touch)[0, 0]) - 0.003) + beside + 0.002 * float(np.linalg.norm(x))
+
+    rng = np.random.default_rng(0)
+    near = sorted((2.0 * rng.normal(size=6) for _ in range(200)), key=lambda x: far(x, False))[:12]
+    there = minimize(far, min(near, key=far), method="Nelder-Mead", options={"maxfev": 150}).x
+    share = gaussian_filter1d(np.clip(1.6 * np.exp(-(((np.arange(120) - 60) / 30.0) ** 2)), 0.0, 1.0), 4.0)
+    source = posed(there, share)
+    out = np.zeros(6)
+    out[:3] = 0.25 * there[:3] / np.linalg.norm(there[:3])
+    led_out = posed(there - out, share)
+    touched = skin_gaps(average, source, touch)[:, 0] < 0.005
+    assert touched.sum() >= 3 and skin_gaps(average, led_out, touch)[touched].min() > 0.02
+
+    group = Group("hand/head", ("right_forearm", "right_hand"), ("head",), arm_turns("right"))
+    fit = mf.adapt.collisions(source, average, _as_fit(led_out, source, average), reference=average, groups=(group,))
+    assert skin_gaps(average, fit.motion, touch)[touched].max() <= 0.02
+    assert (skin_depths(average, fit.motion).depth - skin_depths(average, source).depth).max() < 0.01
+    told = fit.details["collisions"]["right_hand/head"]
+    assert told["touching_before"] < 0.5 and told["touching_after"] == 1.0
 
 
 def test_a_clip_without_collisions_comes_back(sunk, average):

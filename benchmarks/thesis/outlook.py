@@ -27,36 +27,21 @@ from motionfit._motion import Motion
 from motionfit.adapt import measure_standing, source_stance
 from motionfit.balance import sole_boxes
 from motionfit.dynamics import feasibility
-from motionfit.metrics import TOLERANCE, forearm_direction, posed_vertices, skin_depths
+from motionfit.metrics import TOLERANCE, forearm_direction, skin_depths, skin_gaps
 from motionfit.shape.mass import mesh_masses
-from motionfit.shape.surface import find_inside, part_surface
+from motionfit.shape.pairs import Pair
 
 KINDS: dict[str, str] = {
     "hands on hip": "bvh/29_03_teapot_hand_on_hip", "arms crossing": "bvh/02_10_wash_self_arms_crossing",
     "two hands": "bvh/64_01_golf_swing_two_hands", "walk": "bvh/02_01_walk",
 }  # fmt: skip
 OTHER = {"left": "right", "right": "left"}
-TOUCHES = tuple((f"{s}_hand", part) for s, o in OTHER.items() for part in
+TOUCHES = tuple(Pair(f"{s}_hand", part, "") for s, o in OTHER.items() for part in
                 ("torso", "left_thigh", "right_thigh", "head", f"{o}_upper_arm", f"{o}_forearm", f"{o}_hand"))  # fmt: skip
 TOUCHED, KEPT = 0.005, 0.02  # [m]
 SKIN_LOOKS = 40
 COLUMNS = ["clip", "body", "status", "skin %", "all", "worst [cm]", "kept: arms+legs", "kept: all",
            "forearm [deg]", "all", "slide [cm]", "arms+legs", "all", "strain % own", "before", "all", "time [s]"]  # fmt: skip
-
-
-def gaps(character: mf.Character, motion: Motion) -> np.ndarray:
-    """(frames, `TOUCHES`): how far [m] the hand's nearest vertex is from the part's surface; negative inside it."""
-    import igl
-
-    result = np.zeros((motion.frame_count, len(TOUCHES)))
-    for t, vertices in enumerate(posed_vertices(character, motion).astype(float)):
-        for k, (hand, part) in enumerate(TOUCHES):
-            points, surface = vertices[part_surface(character, hand).vertices], part_surface(character, part)
-            mesh = vertices[surface.used], surface.triangles
-            distance = np.sqrt(igl.point_mesh_squared_distance(points, *mesh)[0])
-            distance[find_inside(points, *mesh).points] *= -1.0
-            result[t, k] = distance.min()
-    return result
 
 
 def strain(character: mf.Character, motion: Motion) -> float:
@@ -74,10 +59,10 @@ def strain(character: mf.Character, motion: Motion) -> float:
 def kept(own: np.ndarray, gap: np.ndarray) -> str:
     """Per touched part, the share of its touched frames in which the hand is still near."""
     told = []
-    for k, (hand, part) in enumerate(TOUCHES):
+    for k, pair in enumerate(TOUCHES):
         touched = own[:, k] < TOUCHED
         if touched.any():
-            told.append(f"{hand}/{part} {100 * float((gap[touched, k] <= KEPT).mean()):.0f}% of {int(touched.sum())}")
+            told.append(f"{pair.name} {100 * float((gap[touched, k] <= KEPT).mean()):.0f}% of {int(touched.sum())}")
     return "; ".join(told) or "-"
 
 
@@ -91,13 +76,13 @@ def row(clip: Motion, character: mf.Character, reference: mf.Character) -> list[
     at = np.arange(0, clip.frame_count, max(1, clip.frame_count // SKIN_LOOKS))
     own = skin_depths(reference, original[at]).depth
     before, after = (skin_depths(character, m[at]).depth - own for m in (base, fit.motion))
-    touching = gaps(reference, original[at])
+    touching = skin_gaps(reference, original[at], TOUCHES)
     stance = source_stance(character, base, reference, original)
     slides = [measure_standing(character, m, stance)["feet"] or {} for m in (base, limbs.motion, fit.motion)]
     shares = [100 * float((depth > TOLERANCE).any(1).mean()) for depth in (before, after)]
     return [
         fit.status, *(f"{s:.0f}" for s in shares), f"{100 * after.max():.1f}",
-        *(kept(touching, gaps(character, m[at])) for m in (limbs.motion, fit.motion)),
+        *(kept(touching, skin_gaps(character, m[at], TOUCHES)) for m in (limbs.motion, fit.motion)),
         *(f"{np.rad2deg(forearm_direction(m, base) or 0.0):.1f}" for m in (limbs.motion, fit.motion)),
         *(f"{100 * s['slide_path_m']:.1f}" if s.get("slide_path_m") is not None else "-" for s in slides),
         *(f"{strain(c, m):.0f}" for c, m in ((reference, original), (character, base), (character, fit.motion))),

@@ -26,19 +26,21 @@ from motionfit.adapt._limbs import jerk_scale, smooth_floor
 from motionfit.adapt._limits import NEARLY, SkinLooks
 from motionfit.adapt._record import put_down
 from motionfit.adapt._sampling import Sampling, sampling
-from motionfit.metrics import TOLERANCE, derivative_ratio
+from motionfit.metrics import TOLERANCE, derivative_ratio, skin_gaps
 from motionfit.shape.field import Probes, fit_field
 from motionfit.shape.pairs import PAIRS, Pair
 from motionfit.terms.penetration import SkinClearance, SkinContact
 from motionfit.terms.pose import Effort, Smoothness
 
 ALLOWED_EXCESS = 0.004  # [m] that may stay where more was
-TOUCH = 0.02  # [m] from the surface: what counts as a touch
+TOUCH = 0.02  # [m] from the surface: what counts as a touch on fields, and what a touch may come to
+TOUCHED = 0.01  # [m] on the reference's skin, which knows better
 TOUCH_AIM = 0.012  # [m] a touch is brought back to
+NEAR, EVERY = 0.06, 3  # [m] by the fields: where the skin is asked, in each third frame that is seen
 EASE = 0.08  # [s] within which a touch is taken up and let go
-EFFORT = 0.5  # [rad]
+EFFORT = 1.0  # [rad]
 MOST_JERK = 1.04
-ROUNDS = 4
+ROUNDS, CLOSER = 7, (0, 1, 2)  # and rounds after which more frames are looked at
 HALVINGS = 6  # of what sinks in
 PROBES = {"upper_arm": 20, "forearm": 16, "hand": 16}
 
@@ -81,14 +83,14 @@ class Group(NamedTuple):
 def arm_turns(side: str) -> tuple[Turn, ...]:
     """Shoulder about all axes, elbow about its two useful ones."""
     arm, elbow = f"{side}_upper_arm", f"{side}_forearm"
-    return (*(Turn(f"{arm}_{axis}", ((arm, axis, 1.0),), 0.6) for axis in ("left", "up", "forward")),
+    return (*(Turn(f"{arm}_{axis}", ((arm, axis, 1.0),), 1.0) for axis in ("left", "up", "forward")),
             Turn(f"{elbow}_bend", ((elbow, "bend", 1.0),), 1.0),
             Turn(f"{elbow}_swing", ((elbow, "swing", 1.0),), 0.35))  # fmt: skip
 
 
 def _hands(side: str, other: str) -> tuple[Group, ...]:
     arm, hand = (f"{side}_forearm", f"{side}_hand"), f"{side}_hand"
-    turns = arm_turns(side)
+    turns = (*arm_turns("left"), *arm_turns("right"))  # of both arms: each may touch the other
     return (
         Group(f"{hand}/torso", (f"{side}_upper_arm", *arm), ("torso",), turns),
         Group(f"{hand}/head", arm, ("head",), turns),
@@ -108,10 +110,11 @@ GROUPS: tuple[Group, ...] = (*_hands("left", "right"), *_hands("right", "left"),
 
 
 class Known(NamedTuple):
-    """The clearance of some groups on a body, and the radius [m] of each row."""
+    """The clearance of some groups on a body, the radius [m] of each row, and which rows are those of a part's skin."""
 
     clearance: Clearance
     radius: Float[np.ndarray, " rows"]
+    on_skin: Bool[np.ndarray, " rows"]
 
     def depths(self, motion: Motion) -> Float[np.ndarray, "frames rows"]:
         """Depth [m] of each row in each frame; negative where there is a gap."""
@@ -144,7 +147,7 @@ def _together(groups: Sequence[Group]) -> list[list[Group]]:
 
 
 def known_depths(character: Character, groups: Sequence[Group]) -> Known:
-    pairs, probes, fields, field_of, parts, radius = [], [], [], [], [], []
+    pairs, probes, sets, set_of, parts, radius, on_skin = [], [], [], [], [], [], []
     for group in groups:
         for part in (p for p in (*group.avoid, *(q for q in group.probes if isinstance(q, str))) if p not in PARTS):
             raise InputError(f"group {group.name!r} names unknown part {part!r}; parts: {', '.join(PARTS)}")
@@ -152,17 +155,21 @@ def known_depths(character: Character, groups: Sequence[Group]) -> Known:
             for avoid in group.avoid:
                 name = probe if isinstance(probe, str) else probe.role
                 side = name.partition("_")[0] if name.startswith(SIDES) and avoid == "torso" else "left"
-                if (avoid, side) not in fields:
-                    fields.append((avoid, side))
-                field_of.append(fields.index((avoid, side)))
+                # each hand is a set of its own: a touch by the other is no touch
+                key = (avoid, side, name if name.endswith("hand") else name.partition("_")[0])
+                if key not in sets:
+                    sets.append(key)
+                set_of.append(sets.index(key))
                 pairs.append(Pair(name, avoid, group.name))
                 parts.append(name)
                 radius.append(0.0 if isinstance(probe, str) else probe.radius)
+                on_skin.append(isinstance(probe, str))
                 probes.append(kept_with(character, counted_probes, probe, avoid) if isinstance(probe, str)
                               else _at_sphere(character, probe))  # fmt: skip
-    term = SkinClearance(tuple(probes), tuple(kept_with(character, fit_field, *key) for key in fields), tuple(field_of),
+    term = SkinClearance(tuple(probes), tuple(kept_with(character, fit_field, *key[:2]) for key in sets), tuple(set_of),
                          (np.zeros((1, 1)),) * len(probes))  # fmt: skip
-    return Known(Clearance(term, tuple(pairs), tuple(range(len(pairs))), tuple(parts)), np.array(radius))
+    return Known(Clearance(term, tuple(pairs), tuple(range(len(pairs))), tuple(parts)), np.array(radius),
+                 np.array(on_skin))  # fmt: skip
 
 
 def _at_sphere(character: Character, sphere: Sphere) -> Probes:
@@ -176,56 +183,72 @@ def _solve(
     motion, known = so_far.motion, known_depths(character, groups)
     at = sampling(motion, groups[0].spacing / 60.0)
     small, count = at.motion(motion), len(at.frames)
+    pairs, looks = known.clearance.pairs, skin_looks(clip, character, reference, at)
+    hands = np.array([p.first.endswith("hand") for p in pairs])
     if reference is None:
         own = known.depths(at.motion(so_far.base))
+        touching = hands & (own > -TOUCH)
     else:
-        own = known_depths(reference, groups).depths(at.motion(onto(clip, reference.skeleton)))
+        origin = at.motion(onto(clip, reference.skeleton))
+        own = known_depths(reference, groups).depths(origin)
+        touching = hands & (skin_gaps_near(reference, origin, pairs, -own, known.on_skin) < TOUCHED)
     before = known.depths(small)
-    pairs = known.clearance.pairs
-    inner = np.array([p.adjacent for p in pairs])
-    limit = np.maximum(own, 0.0)
-    # a touch that was meant, by a hand; in the frames around it the hand is on its way
-    touching = (own > -TOUCH) & np.array([p.first.endswith("hand") for p in pairs])
-    told = _told(pairs, before, before, limit, touching, inner)
-    lost = touching & (before < -TOUCH)
-    worst = np.where(inner, 0.0, before - limit)
-    if worst.max(initial=0.0) <= TOLERANCE and not lost.any():
+    # what meets at a joint goes no deeper than it is: on the skin, where that is looked at
+    inner, limit = np.array([p.adjacent for p in pairs]), np.maximum(own, 0.0)
+    most = np.where(inner, np.maximum(before, 0.0) + 0.001 if looks is None else np.inf, limit)
+    allowed = np.where(inner, np.minimum(most, 1e3), limit + ALLOWED_EXCESS)
+
+    def gaps(of: Motion, depths: np.ndarray) -> np.ndarray:
+        return skin_gaps_near(character, of, pairs, -depths, touching & known.on_skin) if looks is not None else -depths
+
+    gap_before = gaps(small, before)
+    told = _told(pairs, before - limit, before - limit, gap_before, gap_before, touching)
+    apart, worst = np.where(touching, gap_before - TOUCH, 0.0), np.where(inner, 0.0, before - limit)
+    if max(worst.max(initial=0.0) - TOLERANCE, apart.max(initial=0.0)) <= 0.0:
         return so_far, told
-    # what meets at a joint is the arm block's, which knows its skin: it goes no deeper than it is
-    allowed = np.where(inner, np.maximum(before, 0.0) + 0.001, limit + ALLOWED_EXCESS)
+    # in the frames around a touch the hand is on its way
     weight = gaussian_filter1d(maximum_filter1d(touching.astype(float), 3, axis=0), EASE / at.dt, axis=0)
-    gap = np.full(own.shape, TOUCH_AIM)
+    gap, off = np.full(own.shape, TOUCH_AIM), np.where(touching, gap_before + before, 0.0)
 
     controls = turn_controls(motion, at.whole, [t for t in groups[0].turns])
     points = Correction.zero(tuple(at.control(c) for c in controls))
     names, real = tuple(c.name for c in controls), np.arange(len(at.rows)) < count
     score = support(known.clearance, small, limit)
     seen = dataclasses.replace(motion[at.rows], dt=np.asarray(at.dt))
-    smooth, history = jerk_scale(motion), []
-    tries = [(_faults(worst, np.where(touching, -before - TOUCH, 0.0)), so_far, before, points)]
-    by_field = [[i for i, owner in enumerate(known.clearance.term.field_of) if owner == k]  # pyright: ignore[reportAttributeAccessIssue]
-                for k in range(len(known.clearance.term.fields))]  # fmt: skip  # pyright: ignore[reportAttributeAccessIssue]
-    for _ in range(ROUNDS):
+    smooth, history, on_skin = jerk_scale(motion), [], np.zeros((1, 1))
+    tries = [(_faults(worst, apart, on_skin), so_far, before, points)]
+    by_set = [[i for i, owner in enumerate(known.clearance.term.field_of) if owner == k]  # pyright: ignore[reportAttributeAccessIssue]
+              for k in range(len(known.clearance.term.fields))]  # fmt: skip  # pyright: ignore[reportAttributeAccessIssue]
+    for round_ in range(ROUNDS):
         smoothed = smooth_floor(allowed, at.dt) - known.radius
         clear = reduced(known.clearance, score, filled(smoothed, at, 1e3), PROBES)
-        # the probes of a field are one set: a touch by any of them is a touch
-        near = np.stack([weight[:, rows].max(axis=1) for rows in by_field], axis=1)
-        wish = np.stack([gap[:, rows].min(axis=1) for rows in by_field], axis=1)
+        # what the fields are off by at a touch is taken off the wish
+        near = np.stack([weight[:, rows].max(axis=1) for rows in by_set], axis=1)
+        wish = np.stack([(gap - off)[:, rows].min(axis=1) for rows in by_set], axis=1)
         terms = {"collisions": clear, "touch": Robust(SkinContact(clear, filled(wish, at, 1e3), filled(near, at, 0.0))),
                  "effort": During(Effort(EFFORT), real.astype(float)),
                  "smoothness": During(Smoothness(smooth), (np.arange(len(at.rows)) < count - 2).astype(float))}  # fmt: skip
+        if looks is not None:
+            terms["skin"] = looks.touch_term(np.arange(len(PAIRS)), ALLOWED_EXCESS, len(at.rows))
         problem = Problem(character, seen, terms, points.controls)
         solved = fit(problem, (Block("collisions", names, max_steps=24, tolerance=1e-3),), correction=points)
         points, history = solved.correction, [*history, *solved.history]
         result = on_top(so_far, Correction(controls, points.points), at)
         moved = at.motion(result.motion)
         after = known.depths(moved)
-        over = np.where(inner, after - np.maximum(before, limit), after - limit)
-        apart = np.where(touching, -after - TOUCH, 0.0)
+        gap_now = gaps(moved, after)
+        over, apart = after - np.maximum(most, limit), np.where(touching, gap_now - TOUCH, 0.0)
+        off = np.where(touching, gap_now + after, 0.0)
+        if looks is not None:
+            if round_ in CLOSER:
+                tries = tries[:1]  # what was looked at in fewer frames cannot be compared
+                looks.look_closer(joint_angles(moved, small).max(axis=1))
+                may = np.maximum(looks.depths(small) - looks.own, NEARLY * TOLERANCE)
+            on_skin = looks.depths_and_touches(moved) - looks.own - may
         jerk = derivative_ratio(result.motion, motion, 3) or 1.0
         if jerk <= MOST_JERK + 0.01:
-            tries.append((_faults(over, apart), result, after, points))
-        if over.max() <= 0.7 * TOLERANCE and apart.max() <= 0.0 and jerk <= MOST_JERK:
+            tries.append((_faults(over, apart, on_skin), result, after, points))
+        if max(over.max() - 0.7 * TOLERANCE, apart.max(), on_skin.max()) <= 0.0 and jerk <= MOST_JERK:
             break
         if jerk > MOST_JERK:
             smooth *= 0.5
@@ -235,25 +258,40 @@ def _solve(
     # a touch that cannot be had without sinking in elsewhere is given up, and so is all that makes matters worse
     _, result, after, points = min(tries, key=lambda t: t[0])
     if result is not so_far:
-        sunk = sinking_skin(clip, character, reference, so_far, result, at)
+        sunk = sinking_skin(looks, small, at)
         result = eased(so_far, Correction(controls, points.points), at, groups[0].spacing / 60.0, sunk)
         after = known.depths(at.motion(result.motion))
-    told = _told(pairs, before, after, limit, touching, inner)
+    told = _told(pairs, before - limit, after - limit, gap_before, gaps(at.motion(result.motion), after), touching)
     left = np.where(inner, 0.0, after - limit).max() > TOLERANCE
     return dataclasses.replace(result, history=(*so_far.history, *history),
                                status="violations_left" if left else so_far.status), told  # fmt: skip
 
 
-def sinking_skin(
-    clip: Motion, character: Character, reference: Character | None, so_far: Fit, whole: Fit, at: Sampling
-):
-    """Says of a fit between `so_far` and `whole` in which of the frames that are seen an arm or leg sinks in that was
-    out: at a shoulder the fields, which controls are solved by, do not know the skin. Nothing without a reference."""
-    small = at.motion(so_far.motion)
-    if reference is None:
+def skin_gaps_near(
+    character: Character, motion: Motion, pairs: Sequence[Pair], by_field: Float[np.ndarray, "frames rows"],
+    which: Bool[np.ndarray, "*frames rows"],
+) -> Float[np.ndarray, "frames rows"]:  # fmt: skip
+    """How far [m] the first parts are from the second: what the fields say, corrected by what the skin shows, of the
+    rows `which`, in some of the frames in which they are near."""
+    wanted = which & (by_field < NEAR)
+    wanted[np.arange(len(wanted)) % EVERY != 0] = False
+    shown, frames, result = skin_gaps(character, motion, pairs, wanted), np.arange(len(wanted)), by_field.copy()
+    for k in np.flatnonzero(wanted.any(axis=0)):
+        asked = np.flatnonzero(wanted[:, k])
+        result[:, k] += np.interp(frames, asked, (shown - by_field)[asked, k])
+    return result
+
+
+def skin_looks(clip: Motion, character: Character, reference: Character | None, at: Sampling) -> SkinLooks | None:
+    """Looks at the skin of arms and legs in the frames that are seen; None without a reference."""
+    return None if reference is None else SkinLooks(clip[at.frames], character, reference, PAIRS)
+
+
+def sinking_skin(looks: SkinLooks | None, small: Motion, at: Sampling) -> Callable[[Fit], Bool[np.ndarray, " seen"]]:
+    """Says of a fit in which of the frames that are seen an arm or leg sinks in that was out in `small`: at a shoulder
+    the fields, which controls are solved by, do not know the skin."""
+    if looks is None:
         return lambda fit: np.zeros(small.frame_count, bool)
-    looks = SkinLooks(clip[at.frames], character, reference, PAIRS)
-    looks.look_closer(joint_angles(at.motion(whole.motion), small).max(axis=1))
     most = np.maximum(looks.depths(small) - looks.own, NEARLY * TOLERANCE)
 
     def sunk(fit: Fit) -> Bool[np.ndarray, " seen"]:
@@ -284,9 +322,13 @@ def eased(
     return so_far
 
 
-def _faults(over: Float[np.ndarray, "frames rows"], apart: Float[np.ndarray, "frames rows"]) -> float:
+def _faults(
+    over: Float[np.ndarray, "frames rows"], apart: Float[np.ndarray, "frames rows"],
+    on_skin: Float[np.ndarray, "looks pairs"],
+) -> float:  # fmt: skip
     """Share of the frames that show a violation, and of those that lost a touch: what a solve is judged by."""
-    return 2.0 * float((over > TOLERANCE).any(axis=1).mean()) + float((apart > 0.0).mean(axis=0).sum())
+    shown = (over > TOLERANCE).any(axis=1).mean() + (on_skin > 0.0).any(axis=1).mean()
+    return 2.0 * float(shown) + float((apart > 0.0).mean(axis=0).sum())
 
 
 def on_top(so_far: Fit, mine: Correction, at: Sampling) -> Fit:
@@ -304,15 +346,15 @@ def filled(rows: np.ndarray, at: Sampling, value: float) -> np.ndarray:
     return np.concatenate([rows, np.full((len(at.rows) - len(rows), rows.shape[1]), value)])
 
 
-def _told(pairs, before, after, limit, touching, inner) -> dict:
+def _told(pairs, excess_before, excess_after, gap_before, gap_after, touching) -> dict:
     told = {}
     for k, pair in enumerate(pairs):
         row = {
-            "excess_before_m": float((before - limit)[:, k].max()),
-            "excess_after_m": float((after - limit)[:, k].max()),
+            "excess_before_m": float(excess_before[:, k].max()),
+            "excess_after_m": float(excess_after[:, k].max()),
         }
         if touching[:, k].any():
-            row["touching_before"] = float((before > -TOUCH)[touching[:, k], k].mean())
-            row["touching_after"] = float((after > -TOUCH)[touching[:, k], k].mean())
+            row["touching_before"] = float((gap_before <= TOUCH)[touching[:, k], k].mean())
+            row["touching_after"] = float((gap_after <= TOUCH)[touching[:, k], k].mean())
         told[pair.name] = row
     return told

@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 from motionfit._character import Character
 from motionfit._control import Correction
 from motionfit._fit import Block, Fit, block_adjoint, block_solver, block_work, fit, solve_block
-from motionfit._motion import Motion, host_kinematics
+from motionfit._motion import Motion, host_kinematics, joint_angles
 from motionfit._onto import onto
 from motionfit._problem import During, Problem
 from motionfit._programs import program
 from motionfit._skeleton import SIDES
 from motionfit.adapt._clearance import reduced, support
-from motionfit.adapt._collisions import Group, eased, filled, known_depths, on_top, sinking_skin
+from motionfit.adapt._collisions import Group, eased, filled, known_depths, on_top, sinking_skin, skin_looks
 from motionfit.adapt._controls import Turn, turn_controls
 from motionfit.adapt._limbs import SOLVE_PROBES, jerk_scale, smooth_floor
 from motionfit.adapt._record import put_down
@@ -110,7 +110,10 @@ def _side(clip: Motion, character: Character, so_far: Fit, reference: Character 
         allowed = allowed - np.where(over > 0.7 * TOLERANCE, np.minimum(over, 0.02), 0.0)
         score = np.maximum(score, support(clear.clearance, at.motion(result.motion), limit))
     # where a forearm cannot point there without sinking in, it comes back in the other frames
-    on_skin = sinking_skin(clip, character, reference, so_far, result, at)
+    looks = skin_looks(clip, character, reference, at)
+    if looks is not None:
+        looks.look_closer(joint_angles(at.motion(result.motion), small).max(axis=1))
+    on_skin = sinking_skin(looks, small, at)
 
     def sunk(fit: Fit) -> Bool[np.ndarray, " seen"]:
         after = clear.depths(at.motion(fit.motion))

@@ -80,6 +80,29 @@ def inside_depths(
     return depth
 
 
+def surface_gap(
+    points: Float[np.ndarray, "points 3"], vertices: Float[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "t 3"]
+) -> float:
+    """How far [m] the nearest of some points is from a surface; where some are inside, how deep the deepest is, below
+    zero."""
+    import igl
+
+    found = find_inside(points, vertices, triangles)
+    if len(found.points):
+        return -float(found.depth.max())
+    # the nearest vertex says which points and triangles can be nearer yet
+    apart = cdist(points, vertices)
+    near = apart.min(axis=1)
+    corners, bound = vertices[triangles], float(near.min())
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    longest = float(np.linalg.norm(high - low, axis=1).max())
+    some = near <= bound + longest
+    box = points[some].min(axis=0) - bound, points[some].max(axis=0) + bound
+    close = ((high >= box[0]) & (low <= box[1])).all(axis=1)
+    squared = igl.point_mesh_squared_distance(points[some], vertices, triangles[close])[0]
+    return float(np.sqrt(max(float(np.min(squared)), 0.0)))
+
+
 def may_be_inside(
     points: Float[np.ndarray, "points 3"], vertices: Float[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "t 3"]
 ) -> Bool[np.ndarray, " points"]:
