@@ -40,8 +40,9 @@ TOUCHES = tuple(Pair(f"{s}_hand", part, "") for s, o in OTHER.items() for part i
                 ("torso", "left_thigh", "right_thigh", "head", f"{o}_upper_arm", f"{o}_forearm", f"{o}_hand"))  # fmt: skip
 TOUCHED, KEPT = 0.005, 0.02  # [m]
 SKIN_LOOKS = 40
-COLUMNS = ["clip", "body", "status", "skin %", "all", "worst [cm]", "kept: arms+legs", "kept: all",
+COLUMNS = ["clip", "body", "status", "skin %", "all", "worst [cm]",
            "forearm [deg]", "all", "slide [cm]", "arms+legs", "all", "strain % own", "before", "all", "time [s]"]  # fmt: skip
+KEPT_COLUMNS = ["clip", "body", "touch", "frames", "kept % arms+legs", "all"]
 
 
 def strain(character: mf.Character, motion: Motion) -> float:
@@ -56,18 +57,19 @@ def strain(character: mf.Character, motion: Motion) -> float:
     return 100.0 * max(found.exceeded.values())
 
 
-def kept(own: np.ndarray, gap: np.ndarray) -> str:
-    """Per touched part, the share of its touched frames in which the hand is still near."""
+def kept(own: np.ndarray, *gaps: np.ndarray) -> list[list[str]]:
+    """Per touched part, how many frames touch, and the share of them in which the hand is still near, by `gaps`."""
     told = []
     for k, pair in enumerate(TOUCHES):
         touched = own[:, k] < TOUCHED
         if touched.any():
-            told.append(f"{pair.name} {100 * float((gap[touched, k] <= KEPT).mean()):.0f}% of {int(touched.sum())}")
-    return "; ".join(told) or "-"
+            shares = (f"{100 * float((gap[touched, k] <= KEPT).mean()):.0f}" for gap in gaps)
+            told.append([pair.name, str(int(touched.sum())), *shares])
+    return told
 
 
-def row(clip: Motion, character: mf.Character, reference: mf.Character) -> list[str]:
-    """One clip on one body, in the order of `COLUMNS` from the status on."""
+def row(clip: Motion, character: mf.Character, reference: mf.Character) -> tuple[list[str], list[list[str]]]:
+    """One clip on one body, in the order of `COLUMNS` from the status on, and of `KEPT_COLUMNS` from the touch on."""
     original, base = mf.onto(clip, reference.skeleton), mf.onto(clip, character.skeleton)
     started = time.perf_counter()
     limbs = mf.adapt(clip, character, reference=reference, blocks=("arms", "legs"))
@@ -80,14 +82,14 @@ def row(clip: Motion, character: mf.Character, reference: mf.Character) -> list[
     stance = source_stance(character, base, reference, original)
     slides = [measure_standing(character, m, stance)["feet"] or {} for m in (base, limbs.motion, fit.motion)]
     shares = [100 * float((depth > TOLERANCE).any(1).mean()) for depth in (before, after)]
+    touches = kept(touching, *(skin_gaps(character, m[at], TOUCHES) for m in (limbs.motion, fit.motion)))
     return [
         fit.status, *(f"{s:.0f}" for s in shares), f"{100 * after.max():.1f}",
-        *(kept(touching, skin_gaps(character, m[at], TOUCHES)) for m in (limbs.motion, fit.motion)),
         *(f"{np.rad2deg(forearm_direction(m, base) or 0.0):.1f}" for m in (limbs.motion, fit.motion)),
         *(f"{100 * s['slide_path_m']:.1f}" if s.get("slide_path_m") is not None else "-" for s in slides),
         *(f"{strain(c, m):.0f}" for c, m in ((reference, original), (character, base), (character, fit.motion))),
         f"{seconds:.0f}",
-    ]  # fmt: skip
+    ], touches  # fmt: skip
 
 
 def main() -> None:
@@ -96,15 +98,19 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=4.0, help="of each clip, from its beginning")
     options = parser.parse_args()
     data, rows = options.data, []
+    touches: list[list[str]] = []
     reference = mf.load_character(data / "characters/avg_male.glb" if data else "builtin:average")
     for body in options.bodies or (["heavy_male"] if data else ["heavy"]):
         character = mf.load_character(data / f"characters/{body}.glb" if data else f"builtin:{body}")
         for kind in options.clips if data else ("walk",):
             clip = mf.load_motion(data / f"{KINDS[kind]}.bvh") if data else samples.walk(cycles=1)
             clip = clip[: max(1, round(options.seconds * clip.frame_rate))]
-            rows.append([kind, body, *row(clip, character, reference)])
-            print(" | ".join(rows[-1]), flush=True)
+            measured, still = row(clip, character, reference)
+            rows.append([kind, body, *measured])
+            touches += [[kind, body, *touch] for touch in still]
+            print(" | ".join([*rows[-1], *(f"{t[0]} {t[2]} -> {t[3]} % of {t[1]}" for t in still)]), flush=True)
     table("What the thesis leaves open", COLUMNS, rows, options.out, "outlook")
+    table("Touches kept", KEPT_COLUMNS, touches, options.out, "touches")
 
 
 if __name__ == "__main__":

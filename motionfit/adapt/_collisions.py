@@ -36,12 +36,15 @@ ALLOWED_EXCESS = 0.004  # [m] that may stay where more was
 TOUCH = 0.02  # [m] from the surface: what counts as a touch on fields, and what a touch may come to
 TOUCHED = 0.01  # [m] on the reference's skin, which knows better
 TOUCH_AIM = 0.012  # [m] a touch is brought back to
+HELD = 0.016  # [m] a solve is content with: where an arm then sinks in, a touch gives way a little
 NEAR, EVERY = 0.06, 3  # [m] by the fields: where the skin is asked, in each third frame that is seen
 EASE = 0.08  # [s] within which a touch is taken up and let go
 EFFORT = 1.0  # [rad]
 MOST_JERK = 1.04
-ROUNDS, CLOSER = 7, (0, 1, 2)  # and rounds after which more frames are looked at
-HALVINGS = 6  # of what sinks in
+ROUNDS, PATIENCE = 12, 3  # rounds at most, and without a better result
+CLOSER = (0, 1, 2)  # rounds after which more frames are looked at
+GIVES = (0.1, 0.2, 0.3, *(0.5,) * 5)  # of what sinks in, one after the other: a touch bears little of it
+STIFFER = 4.0  # weight of what the skin shows, against the touches that pull the other way
 PROBES = {"upper_arm": 20, "forearm": 16, "hand": 16}
 
 
@@ -230,14 +233,14 @@ def _solve(
                  "smoothness": During(Smoothness(smooth), (np.arange(len(at.rows)) < count - 2).astype(float))}  # fmt: skip
         if looks is not None:
             terms["skin"] = looks.touch_term(np.arange(len(PAIRS)), ALLOWED_EXCESS, len(at.rows))
-        problem = Problem(character, seen, terms, points.controls)
+        problem = Problem(character, seen, terms, points.controls, {"skin": STIFFER} if looks is not None else None)
         solved = fit(problem, (Block("collisions", names, max_steps=24, tolerance=1e-3),), correction=points)
         points, history = solved.correction, [*history, *solved.history]
         result = on_top(so_far, Correction(controls, points.points), at)
         moved = at.motion(result.motion)
         after = known.depths(moved)
         gap_now = gaps(moved, after)
-        over, apart = after - np.maximum(most, limit), np.where(touching, gap_now - TOUCH, 0.0)
+        over, apart = after - np.maximum(most, limit), np.where(touching, gap_now - HELD, 0.0)
         off = np.where(touching, gap_now + after, 0.0)
         if looks is not None:
             if round_ in CLOSER:
@@ -248,12 +251,14 @@ def _solve(
         jerk = derivative_ratio(result.motion, motion, 3) or 1.0
         if jerk <= MOST_JERK + 0.01:
             tries.append((_faults(over, apart, on_skin), result, after, points))
-        if max(over.max() - 0.7 * TOLERANCE, apart.max(), on_skin.max()) <= 0.0 and jerk <= MOST_JERK:
+        done = max(over.max() - 0.7 * TOLERANCE, apart.max(), on_skin.max()) <= 0.0 and jerk <= MOST_JERK
+        stale = len(tries) - 1 - int(np.argmin([t[0] for t in tries]))
+        if done or stale >= PATIENCE:
             break
         if jerk > MOST_JERK:
             smooth *= 0.5
         allowed = allowed - np.where(over > 0.7 * TOLERANCE, np.minimum(over, 0.02), 0.0)
-        gap = gap - np.where(apart > 0.0, np.minimum(apart + 0.003, 0.01), 0.0)
+        gap = gap - np.where(apart > 0.0, np.minimum(apart + 0.003, 0.02), 0.0)
         score = np.maximum(score, support(known.clearance, moved, limit))
     # a touch that cannot be had without sinking in elsewhere is given up, and so is all that makes matters worse
     _, result, after, points = min(tries, key=lambda t: t[0])
@@ -308,7 +313,7 @@ def eased(
     """A fit with more controls on top, of knots every `spacing` [s], and less and less of them around the frames that
     show something `sunk`."""
     share, width = np.ones(at.basis.count), EASE / spacing
-    for _ in range(HALVINGS):
+    for gives in GIVES:
         less = dataclasses.replace(mine, points=tuple(share * np.asarray(p)[: len(share)] for p in mine.points))
         result = on_top(so_far, less, at)
         where = sunk(result)
@@ -318,7 +323,7 @@ def eased(
         around = np.zeros(at.basis.count)
         around[np.asarray(at.basis.first)[np.flatnonzero(where)][:, None] + np.arange(4)] = 1.0
         around = gaussian_filter1d(maximum_filter1d(around, 2 * round(2 * width) + 1), width)
-        share = share * (1.0 - 0.5 * around) if where.any() else 0.5 * share
+        share = share * (1.0 - gives * around) if where.any() else (1.0 - gives) * share
     return so_far
 
 
