@@ -130,10 +130,12 @@ def collisions(
 ) -> Fit:  # fmt: skip
     """Take the groups' probes out of what they shall avoid, as far as they are deeper in than on `reference`.
 
-    Where a hand touched on the reference (within 2 cm), it is brought back to the surface. Without a reference, what
-    the character shows with the clip before any correction may stay and touches. What the arm and leg blocks reached is
-    not undone: their pairs are in the tables. `details["collisions"]` holds per pair the greatest excess [m] before
-    and after, and the share of the touched frames that still touch.
+    Where a hand touched on the reference (within 1 cm, on the skin), it is brought back to within 2 cm of the surface,
+    as far as nothing sinks in for it. Without a reference, what the character shows with the clip before any correction
+    may stay and touches, by the fields. What the arm and leg blocks reached is not undone: their pairs are in the
+    tables, and with a reference what their skins show more becomes rows of the solve, as in `motionfit.adapt.limbs`.
+    `details["collisions"]` holds per pair the greatest excess [m] before and after, and the share of the touched frames
+    that still touch.
     """
     result, told = so_far, {}
     for some in _together(groups):
