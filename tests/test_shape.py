@@ -27,7 +27,7 @@ from motionfit.shape.field import (
     standing,
     standing_vertices,
 )
-from motionfit.shape.surface import inside_depths, may_be_inside, part_surface
+from motionfit.shape.surface import inside_depths, may_be_inside, part_surface, surface_gap
 from motionfit.shape.volumes import fit_volumes
 from tests.helpers import central_difference
 
@@ -108,6 +108,12 @@ def test_a_field_tells_the_depth_below_the_skin(heavy):
         assert np.mean(told[exact == 0] < 0.004) > 0.95, part
 
 
+def test_a_point_over_the_middle_of_a_triangle_may_be_nearer_than_one_at_a_corner():
+    box = trimesh.creation.box((1.0, 1.0, 1.0))
+    points = np.array([[0.5, 0.5, 0.6], [0.2, 0.1, 0.55]])
+    assert abs(surface_gap(points, np.asarray(box.vertices), np.asarray(box.faces, np.int64)) - 0.05) < 1e-9
+
+
 @given(st.integers(0, 2**31), st.sampled_from(["torso", "left_upper_arm", "right_forearm", "left_thigh", "right_calf"]))
 def test_inside_depths_are_those_of_all_triangles(heavy, seed, part):
     """What spares libigl its trees changes nothing: in random poses, for points on, around and far from a part."""
@@ -124,6 +130,9 @@ def test_inside_depths_are_those_of_all_triangles(heavy, seed, part):
     distance = np.sqrt(np.asarray(igl.point_mesh_squared_distance(points, vertices, surface.triangles)[0]))
     wanted = np.where(inside, distance, 0.0)
     assert np.abs(inside_depths(points, vertices, surface.triangles) - wanted).max() < 1e-6
+    for some, gap in ((~inside, distance[~inside].min(initial=np.inf)), (inside, -distance[inside].max(initial=0.0))):
+        if some.any():
+            assert abs(surface_gap(points[some], vertices, surface.triangles) - gap) < 1e-6
 
 
 def test_a_field_moves_with_its_part(heavy, rng):
