@@ -8,6 +8,8 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 
+from motionfit._traces import kept
+
 FULL = 0.6  # of the memory maps that a process may have; a first adaptation takes five thousand of usually 65,530
 
 
@@ -15,18 +17,11 @@ def program(fn: Callable) -> Callable:
     """A function that ends on the host, jitted so that it compiles fast: never to be called under another jit.
 
     XLA has emitted the fusions of a CPU through MLIR since jaxlib 0.9.1 (openxla/xla#41173 for what that costs), which
-    takes a block's solve twice as long to compile as its older emitters do, and makes it no faster to run.
+    takes a block's solve twice as long to compile as its older emitters do, and makes it no faster to run. Where
+    `keep_programs` named a folder, the trace is kept there.
     """
 
-    @functools.cache
-    def jitted():
-        return eqx.filter_jit(fn, compiler_options=_options())  # pyright: ignore[reportCallIssue]
-
-    @functools.wraps(fn)
-    def call(*args, **kwargs):
-        return jitted()(*args, **kwargs)
-
-    return call
+    return kept(fn, lambda fn: eqx.filter_jit(fn, compiler_options=_options()))  # pyright: ignore[reportCallIssue]
 
 
 @functools.cache

@@ -389,22 +389,18 @@ def _print_feet(columns: dict[str, dict]) -> None:
     Console(width=100).print(table)
 
 
-def _compilation_cache() -> None:
-    """Keep compiled programs in the user's cache folder; JAX_COMPILATION_CACHE_DIR= (empty) turns it off."""
-    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+def _keep_programs() -> None:
+    """Keep programs in the user's cache folder; JAX_COMPILATION_CACHE_DIR= (empty) turns it off."""
+    chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    if chosen == "":
         return
-    import jax
-
+    from motionfit._traces import keep_programs
     from motionfit.shape.bodies import cache_folder
 
     try:
-        folder = cache_folder() / "xla"
-        folder.mkdir(parents=True, exist_ok=True)
+        keep_programs(pathlib.Path(chosen) if chosen else cache_folder() / "xla")
     except OSError:
-        return
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+        return  # a cache that cannot be written costs time, nothing else
 
 
 def main() -> None:
@@ -412,7 +408,7 @@ def main() -> None:
     from motionfit._types import InputError
 
     try:
-        _compilation_cache()
+        _keep_programs()
         app()
     except InputError as error:
         sys.stderr.write(f"motionfit: {' '.join(str(error).split())}\n")
