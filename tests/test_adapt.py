@@ -13,7 +13,7 @@ import motionfit as mf
 from benchmarks.metrics import compilations
 from motionfit import samples
 from motionfit._motion import joint_angles, resample
-from motionfit.adapt._clearance import build_clearance, support
+from motionfit.adapt._clearance import build_clearance, probe_depths, support
 from motionfit.adapt._limbs import _own_sets, _stages
 from motionfit.metrics import derivative_ratio, skin_depths
 from motionfit.shape.growth import grow
@@ -186,10 +186,12 @@ def test_a_block_chooses_its_probes_by_their_own_part_in_what_is_wrong(heavy):
     walk, pairs = mf.onto(samples.walk(cycles=1), heavy.skeleton)[::4], pairs_of("arms", "legs")
     everything = build_clearance(heavy, pairs)
     allowed = np.random.default_rng(0).uniform(0.0, 0.03, (walk.frame_count, len(pairs)))
-    together = support(everything, walk, allowed)
+    together = support(everything, probe_depths(everything, walk), allowed)
     for stage in _stages(heavy, ("arms", "legs"), pairs, "vertex", allowed, np.zeros(len(pairs), bool)):
         mine = _own_sets(everything, stage)
-        np.testing.assert_allclose(together[mine], support(stage.clearance, walk, stage.allowed), rtol=1e-6)
+        np.testing.assert_allclose(
+            together[mine], support(stage.clearance, probe_depths(stage.clearance, walk), stage.allowed), rtol=1e-6
+        )
 
 
 def test_what_touches_at_a_grown_armpit_comes_out(shared_data):

@@ -20,7 +20,7 @@ from motionfit import samples
 from motionfit._control import Correction
 from motionfit._motion import Motion, resample
 from motionfit.adapt import build_clearance, reference_depths, volume_depths
-from motionfit.adapt._clearance import reduced, support
+from motionfit.adapt._clearance import probe_depths, reduced, support
 from motionfit.adapt._controls import arm_controls
 from motionfit.adapt._limbs import SOLVE_PROBES, jerk_scale
 from motionfit.metrics import TOLERANCE, derivative_ratio
@@ -45,7 +45,7 @@ class Arm:
 
     def solve(self, basis: Basis) -> dict:
         controls = tuple(c for c in arm_controls(self.character, self.base, basis) if c.name.startswith("left"))
-        score = support(self.clearance, self.base, self.own)
+        score = support(self.clearance, probe_depths(self.clearance, self.base), self.own)
         terms = {"clearance": reduced(self.clearance, score, self.own + ALLOWED, SOLVE_PROBES), "effort": Effort(1.0),
                  "smoothness": Smoothness(jerk_scale(self.base))}  # fmt: skip
         problem = mf.Problem(self.character, self.base, terms, controls)

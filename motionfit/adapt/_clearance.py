@@ -175,7 +175,7 @@ def _look(look, term: Term, motion: Motion):
 def all_rows(term: Term, motion: Motion) -> Float[np.ndarray, "frames rows"]:
     """Depth [m] of every row of a term in every frame; negative where there is a gap."""
     if isinstance(term, SkinClearance):
-        return over_time(_point_depths, term, motion).max(axis=2).astype(float)
+        return _point_by_point(term, motion).max(axis=2).astype(float)
     return over_time(row_depths, term, motion).astype(float)
 
 
@@ -185,6 +185,10 @@ def row_depths(term: Term, kin: Kinematics) -> Float[Array, "frames rows"]:
     return term.depth(kin)
 
 
+def _point_by_point(term: SkinClearance, motion: Motion) -> Float[np.ndarray, "frames sets points"]:
+    return over_time(_point_depths, term, motion)
+
+
 def _point_depths(term: SkinClearance, kin: Kinematics) -> Float[Array, "frames sets points"]:
     depths = term.point_depths(kin)
     most = max(d.shape[1] for d in depths)
@@ -192,22 +196,33 @@ def _point_depths(term: SkinClearance, kin: Kinematics) -> Float[Array, "frames 
     return jnp.stack([jnp.pad(d, ((0, 0), (0, most - d.shape[1])), mode="edge") for d in depths], axis=1)
 
 
-def volume_depths(clearance: Clearance, motion: Motion) -> Float[np.ndarray, "frames pairs"]:
-    """Depth [m] of every pair in every frame on the volumes, 0 where they are apart."""
-    rows = all_rows(clearance.term, motion)
+def probe_depths(clearance: Clearance, motion: Motion) -> Float[np.ndarray, "frames sets points"] | None:
+    """Depth [m] of every probe in every frame; None where an objective has no probes."""
+    return _point_by_point(clearance.term, motion) if isinstance(clearance.term, SkinClearance) else None
+
+
+def volume_depths(
+    clearance: Clearance, motion: Motion, probes: Float[np.ndarray, "frames sets points"] | None = None
+) -> Float[np.ndarray, "frames pairs"]:
+    """Depth [m] of every pair in every frame on the volumes, 0 where they are apart. `probes` are the motion's
+    `probe_depths`, where they are at hand."""
+    rows = all_rows(clearance.term, motion) if probes is None else probes.max(axis=2).astype(float)
     owner = np.array(clearance.pair_of_row)
     depth = np.stack([rows[:, owner == k].max(axis=1) for k in range(len(clearance.pairs))], axis=1)
     return np.maximum(depth, 0.0)
 
 
 def support(
-    clearance: Clearance, motion: Motion, allowed: Float[np.ndarray, "frames pairs"]
-) -> Float[np.ndarray, "sets points"]:
-    """How much each probe has to do with the depth of its pair over the clip: what `reduced` goes by.
+    clearance: Clearance, depth: Float[np.ndarray, "frames sets points"] | None,
+    allowed: Float[np.ndarray, "frames pairs"],
+) -> Float[np.ndarray, "sets points"]:  # fmt: skip
+    """How much each probe has to do with the depth of its pair over a clip, from its `probe_depths`: what `reduced`
+    goes by.
 
     It is how often a point is within 5 mm of its set's deepest, where the set is near to showing too much.
     """
-    depth = over_time(_point_depths, clearance.term, motion)
+    if depth is None:
+        return np.zeros((0, 0))
     deepest = depth.max(axis=2, keepdims=True)
     matters = expit((deepest - allowed[:, list(clearance.pair_of_row), None]) / 0.01)
     return (matters * np.clip(1.0 + (depth - deepest) / 0.005, 0.0, 1.0) + 1e-3 * depth).sum(axis=0)

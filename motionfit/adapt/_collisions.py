@@ -20,7 +20,7 @@ from motionfit._onto import onto
 from motionfit._problem import During, Problem, Robust
 from motionfit._skeleton import SIDES
 from motionfit._types import InputError
-from motionfit.adapt._clearance import Clearance, all_rows, counted_probes, kept_with, reduced, support
+from motionfit.adapt._clearance import Clearance, all_rows, counted_probes, kept_with, probe_depths, reduced, support
 from motionfit.adapt._controls import Turn, turn_controls
 from motionfit.adapt._limbs import jerk_scale, smooth_floor
 from motionfit.adapt._limits import NEARLY, SkinLooks
@@ -218,7 +218,7 @@ def _solve(
     controls = turn_controls(motion, at.whole, [t for t in groups[0].turns])
     points = Correction.zero(tuple(at.control(c) for c in controls))
     names, real = tuple(c.name for c in controls), np.arange(len(at.rows)) < count
-    score = support(known.clearance, small, limit)
+    score = support(known.clearance, probe_depths(known.clearance, small), limit)
     seen = dataclasses.replace(motion[at.rows], dt=np.asarray(at.dt))
     smooth, history, on_skin = jerk_scale(motion), [], np.zeros((1, 1))
     tries = [(_faults(worst, apart, on_skin), so_far, before, points)]
@@ -261,7 +261,7 @@ def _solve(
             smooth *= 0.5
         allowed = allowed - np.where(over > 0.7 * TOLERANCE, np.minimum(over, 0.02), 0.0)
         gap = gap - np.where(apart > 0.0, np.minimum(apart + 0.003, 0.02), 0.0)
-        score = np.maximum(score, support(known.clearance, moved, limit))
+        score = np.maximum(score, support(known.clearance, probe_depths(known.clearance, moved), limit))
     # a touch that cannot be had without sinking in elsewhere is given up, and so is all that makes matters worse
     _, result, after, points = min(tries, key=lambda t: t[0])
     if result is not so_far:

@@ -16,7 +16,7 @@ from motionfit._onto import onto
 from motionfit._problem import During, Problem
 from motionfit._programs import program
 from motionfit._skeleton import SIDES
-from motionfit.adapt._clearance import reduced, support
+from motionfit.adapt._clearance import probe_depths, reduced, support
 from motionfit.adapt._collisions import Group, eased, filled, known_depths, on_top, sinking_skin, skin_looks
 from motionfit.adapt._controls import Turn, turn_controls
 from motionfit.adapt._limbs import SOLVE_PROBES, jerk_scale, smooth_floor
@@ -82,7 +82,10 @@ def _side(clip: Motion, character: Character, so_far: Fit, reference: Character 
     body, own = (character, at.motion(so_far.base)) if reference is None else (
         reference, at.motion(onto(clip, reference.skeleton)))  # fmt: skip
     limit, before = np.maximum(known_depths(body, (group,)).depths(own), 0.0), clear.depths(small)
-    allowed, score = np.maximum(limit + ALLOWED_EXCESS, before), support(clear.clearance, small, limit)
+    allowed, score = (
+        np.maximum(limit + ALLOWED_EXCESS, before),
+        support(clear.clearance, probe_depths(clear.clearance, small), limit),
+    )
     controls = turn_controls(motion, at.whole, forearm_turns(side))
     seen = dataclasses.replace(motion[at.rows], dt=np.asarray(at.dt))
     points = Correction.zero(tuple(at.control(c) for c in controls))
@@ -108,7 +111,8 @@ def _side(clip: Motion, character: Character, so_far: Fit, reference: Character 
         if jerk > MOST_JERK:
             smooth *= 0.4
         allowed = allowed - np.where(over > 0.7 * TOLERANCE, np.minimum(over, 0.02), 0.0)
-        score = np.maximum(score, support(clear.clearance, at.motion(result.motion), limit))
+        moved = probe_depths(clear.clearance, at.motion(result.motion))
+        score = np.maximum(score, support(clear.clearance, moved, limit))
     # where a forearm cannot point there without sinking in, it comes back in the other frames
     looks = skin_looks(clip, character, reference, at)
     if looks is not None:

@@ -16,7 +16,15 @@ from motionfit._onto import onto
 from motionfit._problem import During, Problem, Term
 from motionfit._skeleton import SIDES
 from motionfit._types import InputError
-from motionfit.adapt._clearance import Clearance, allowance, build_clearance, reduced, support, volume_depths
+from motionfit.adapt._clearance import (
+    Clearance,
+    allowance,
+    build_clearance,
+    probe_depths,
+    reduced,
+    support,
+    volume_depths,
+)
 from motionfit.adapt._controls import arm_controls, leg_controls
 from motionfit.adapt._limits import ENOUGH, NEARLY, SkinLooks, reference_depths
 from motionfit.adapt._sampling import SOLVE_RATE, sampling
@@ -137,7 +145,8 @@ def limbs(
     known = source is not None
     source = (clip if source is None else source)[seen.frames]
     own = reference_depths(source, character, reference, pairs, objective)
-    before = volume_depths(everything, small)
+    probes = at_first = probe_depths(everything, small)
+    before = volume_depths(everything, small, at_first)
     excess = before - own
     most, kept = excess.max(axis=0), own + allowance(excess, ALLOWED_EXCESS, MARGIN)
     quiet = most <= TOLERANCE  # a pair that shows no violation is left alone
@@ -162,7 +171,7 @@ def limbs(
     held_back = np.zeros_like(own) if start is None else np.where(quiet, 0.0, start.details["held_back_m"])
 
     stages = _stages(character, blocks, pairs, objective, allowed - held_back, quiet, looks is not None)
-    smooth, history, moved = jerk_scale(base), [], small
+    smooth, history = jerk_scale(base), []
     # by name: later blocks may have added controls of their own
     points = (Correction.zero(seen.controls).points if start is None
               else [start.correction[c.name] for c in seen.controls])  # fmt: skip
@@ -180,14 +189,15 @@ def limbs(
 
     settled = known and bool(quiet.all())  # and what is settled was looked at closely then
     for round_ in range(ROUNDS):
-        problem = _problem(character, seen, stages, smooth, everything, (small, moved), looks)
+        problem = _problem(character, seen, stages, smooth, everything, (at_first, probes), looks)
         result = fit(problem, _side_by_side(stages), sweeps, correction=correction, progress=told(round_))
         if not round_ and start is None:
             result = _from_elsewhere(problem, result, stages)
         correction, history = result.correction, [*history, *result.history]
         moved = result.motion[np.arange(small.frame_count)]
         used = np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
-        after = volume_depths(everything, moved)
+        probes = probe_depths(everything, moved)
+        after = volume_depths(everything, moved, probes)
         if looks is None:
             left = np.where(quiet, 0.0, after - own)
         else:
@@ -366,15 +376,15 @@ def _own_sets(everything: Clearance, stage: Stage) -> Bool[np.ndarray, " sets"]:
 
 def _problem(
     character: Character, seen: Seen, stages: list[Stage], smooth: float,
-    everything: Clearance, motions: tuple[Motion, ...], looks: SkinLooks | None,
+    everything: Clearance, probes: tuple[Float[np.ndarray, "frames sets points"] | None, ...], looks: SkinLooks | None,
 ) -> Problem:  # fmt: skip
-    """The terms of all stages; probes are chosen by what they had to do with in `motions`."""
+    """The terms of all stages; `probes` are the depths of all, by which those that matter are chosen."""
     real, length = seen.motion.frame_count, seen.padded.frame_count
     terms: dict[str, Term] = {}
     scores = np.zeros((0, 0))
     if everything.part_of_set:
         allowed = np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
-        scores = np.sum([support(everything, motion, allowed) for motion in motions], axis=0)
+        scores = np.sum([support(everything, depth, allowed) for depth in probes], axis=0)
     for stage in stages:
         # however much the skin shows: a part that is LEAST_GAP away from the other's field is pushed no further
         limit = np.maximum(stage.allowed, -LEAST_GAP)

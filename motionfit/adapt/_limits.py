@@ -1,5 +1,8 @@
 """What overlap does not count, that of the reference body, and looks at the skin itself."""
 
+import hashlib
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import maximum_filter1d
@@ -33,11 +36,22 @@ def reference_depths(
     return volume_depths(clearance, onto(clip, body.skeleton))
 
 
+class Look(NamedTuple):
+    """What one look at the skin showed."""
+
+    pose: bytes  # that was looked at
+    depths: Float[np.ndarray, " pairs"]  # [m]
+    touches: Touches
+
+
 class SkinLooks:
     """Looks at the skinned mesh itself, at some frames of a clip.
 
     Near the shoulder the skin follows arm and trunk at once, and the fold of the joint is not quite where a field of
     one pose says. So what touches in a look becomes rows for the solver.
+
+    A look takes ten milliseconds or more, so no pose is looked at twice: what a frame showed last is kept here, and
+    what the reference shows is kept with the reference, for the next body and the next round.
     """
 
     def __init__(self, clip: Motion, character: Character, reference: Character, pairs: tuple[Pair, ...]):
@@ -47,30 +61,57 @@ class SkinLooks:
         count = min(clip.frame_count, max(LEAST_LOOKS, round(clip.frame_count * LOOK_SHARE)))
         self.at: Int[np.ndarray, " looks"] = np.unique(np.linspace(0, clip.frame_count - 1, count).round().astype(int))
         self.own = self._own(self.at)
+        self.seen: dict[int, Look] = {}  # by frame, the latest
         self.touches: dict[int, Touches] = {}
+        self.found_in: dict[int, bytes] = {}  # the pose of the latest of them
         self.deepest = np.zeros_like(self.own)  # [m] of excess in any look, where touches were found
         self.eased = np.zeros_like(self.own)  # the share of it that touches may show again
 
     def _own(self, at: Int[np.ndarray, " some"]) -> Float[np.ndarray, "some pairs"]:
         """What the reference shows."""
-        return skin_depths(self.reference, onto(self.clip[at], self.reference.skeleton), self.pairs).depth
+        played = onto(self.clip[at], self.reference.skeleton)
+        known = self.reference.memo.setdefault(("shown", self.pairs), {})
+        poses = _poses(played)
+        new = np.array([i for i, pose in enumerate(poses) if pose not in known], int)
+        if len(new):
+            shown = skin_depths(self.reference, played[new], self.pairs).depth
+            known.update({poses[i]: depths for i, depths in zip(new, shown, strict=True)})
+        return np.array([known[pose] for pose in poses]).reshape(len(at), len(self.pairs))
 
     def depths(self, motion: Motion) -> Float[np.ndarray, "looks pairs"]:
         """Depth [m] per look and pair of a motion of the solver's frames."""
-        return skin_depths(self.character, motion[self.at], self.pairs).depth
+        self._look(motion)
+        return np.array([self.seen[frame].depths for frame in self.at.tolist()])
 
     def depths_and_touches(self, motion: Motion) -> Float[np.ndarray, "looks pairs"]:
         """The same, and what goes beyond the reference is kept: `touches`, by frame, the latest ones first."""
-        seen = motion[self.at]
-        rotations, result = host_kinematics(seen)[1], np.zeros(self.own.shape)
-        for i, vertices, found in insides(self.character, seen, self.pairs):
-            for (pair, *_), inside in found.items():
-                result[i, pair] = max(result[i, pair], inside.depth.max(initial=0.0))
-            new, frame = touches_of(self.character, rotations[i], vertices, found, self.own[i]), int(self.at[i])
-            self.touches[frame] = new.then(self.touches[frame]) if frame in self.touches else new
+        result = self.depths(motion)
+        for frame in self.at.tolist():
+            pose, _, new = self.seen[frame]
+            if self.found_in.get(frame) != pose:
+                self.touches[frame] = new.then(self.touches[frame]) if frame in self.touches else new
+                self.found_in[frame] = pose
         if not self.eased.any():
             self.deepest = np.maximum(self.deepest, result - self.own)
         return result
+
+    def _look(self, motion: Motion) -> None:
+        """Look at the frames whose pose is another than the one seen last."""
+        looked = motion[self.at]
+        poses = _poses(looked)
+        new = [i for i, frame in enumerate(self.at.tolist())
+               if frame not in self.seen or self.seen[frame].pose != poses[i]]  # fmt: skip
+        if not new:
+            return
+        looked = looked[np.array(new)]
+        rotations = host_kinematics(looked)[1]
+        for k, vertices, found in insides(self.character, looked, self.pairs):
+            depths = np.zeros(len(self.pairs))
+            for (pair, *_), inside in found.items():
+                depths[pair] = max(depths[pair], inside.depth.max(initial=0.0))
+            i = new[k]
+            touches = touches_of(self.character, rotations[k], vertices, found, self.own[i])
+            self.seen[int(self.at[i])] = Look(poses[i], depths, touches)
 
     def touch_term(self, columns: Int[np.ndarray, " some"], allowed: float, length: int) -> TouchClearance:
         """The touches of some pairs as rows for the solver, up to `allowed` [m] more than the reference shows."""
@@ -122,3 +163,10 @@ class SkinLooks:
         excess = excess.copy()
         excess[self.at] = np.maximum(excess[self.at], on_skin)
         return np.where(quiet, 0.0, excess)
+
+
+def _poses(motion: Motion) -> list[bytes]:
+    """What tells the frames of a motion apart: the skin is a function of it."""
+    arrays = [motion.root, motion.rotations, *(() if motion.translations is None else (motion.translations,))]
+    rows = [np.ascontiguousarray(np.asarray(x)).reshape(motion.frame_count, -1) for x in arrays]
+    return [hashlib.sha256(b"".join(r[t].tobytes() for r in rows)).digest() for t in range(motion.frame_count)]
