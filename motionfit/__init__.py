@@ -35,6 +35,7 @@ from motionfit._problem import Term as Term
 from motionfit._skeleton import Skeleton as Skeleton
 from motionfit._skinning import Skin as Skin
 from motionfit._skinning import skin as skin
+from motionfit._traces import keep_programs as keep_programs
 from motionfit._types import InputError as InputError
 from motionfit.adapt._many import adapt_many as adapt_many
 from motionfit.feet._remove import detect_footplants as detect_footplants
@@ -54,6 +55,6 @@ else:
 __all__ = [
     "Block", "Character", "Control", "Correction", "Custom", "Drive", "During", "Energy", "Fit", "InputError",
     "Kinematics", "Motion", "Problem", "Robust", "Skeleton", "Skin", "Term", "adapt", "adapt_many", "balance", "detect_footplants",
-    "dynamics", "feet", "fit", "forward_kinematics", "ik", "load_character", "load_correction", "load_motion", "measure",
+    "dynamics", "feet", "fit", "forward_kinematics", "ik", "keep_programs", "load_character", "load_correction", "load_motion", "measure",
     "metrics", "onto", "remove_footskate", "resample", "rotation", "save", "shape", "skin", "splines", "terms",
 ]  # fmt: skip

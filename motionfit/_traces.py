@@ -21,17 +21,33 @@ import equinox as eqx
 import jax
 from jax import export
 
+from motionfit._cache import cache_folder, remember
+from motionfit._types import InputError
+
 LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy")  # what a trace may speak of, besides us
 KNOWN = {"motionfit", "builtins", *LIBRARIES}
 _folder: pathlib.Path | None = None
 
 
-def keep_programs(folder: pathlib.Path) -> None:
-    """From now on keep what is traced and compiled in a folder, and look there before anything is traced."""
+def keep_programs(folder: str | os.PathLike | None = None) -> None:
+    """From now on keep what is traced and compiled in a folder, and look there first: the command line does so.
+
+    None: the one that JAX_COMPILATION_CACHE_DIR names (empty: none, nothing is kept), else `xla` in the cache folder,
+    MOTIONFIT_CACHE or the user's. Call it once, before the first adaptation.
+    """
     global _folder
-    folder.mkdir(parents=True, exist_ok=True)
-    _folder = folder
-    jax.config.update("jax_compilation_cache_dir", str(folder))
+    chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    if folder is None and chosen == "":
+        return
+    place = pathlib.Path(folder or chosen or cache_folder() / "xla")
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        if folder is None:
+            return  # a cache that cannot be written costs time, nothing else
+        raise InputError(f"{place}: cannot be made a folder ({error.strerror}); choose another") from None
+    _folder = place
+    jax.config.update("jax_compilation_cache_dir", str(place))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
@@ -49,7 +65,7 @@ def kept(fn: Callable, jitted: Callable[[Callable], Callable]) -> Callable:
         arrays, rest = eqx.partition((args, kwargs), eqx.is_array)
         leaves, structure = jax.tree.flatten(arrays)
         shapes = tuple((x.shape, str(x.dtype), getattr(x, "weak_type", False)) for x in leaves)
-        key = structure, tuple(jax.tree.leaves(rest)), shapes, _settings()
+        key = structure, tuple((type(x), x) for x in jax.tree.leaves(rest)), shapes, _settings()
         with lock:  # two blocks of one structure side by side trace it once; others do not wait
             mine = ready.setdefault(key, threading.Lock())
         if not callable(mine):
@@ -77,7 +93,7 @@ def _program(fn, rest, structure, leaves, about: str, jitted: Callable) -> Calla
         if found is None:
             return None
         exported, shape = found
-        _remember(file, pickle.dumps((bytes(exported.serialize()), shape)))
+        remember(file, pickle.dumps((bytes(exported.serialize()), shape)))
     run, back = jitted(exported.call), jax.tree.structure(shape)
 
     def call(*args, **kwargs):
@@ -109,19 +125,25 @@ def _traced(fn, rest, structure, leaves):
 class _OnlyKnown(pickle.Pickler):
     def reducer_override(self, obj):
         if isinstance(obj, type | types.FunctionType | types.BuiltinFunctionType):
-            if (obj.__module__ or "").partition(".")[0] not in KNOWN:
+            if not _known(obj):
                 raise pickle.PicklingError(f"{obj.__qualname__} is from elsewhere")
         return NotImplemented
 
 
+def _known(obj) -> bool:
+    return (obj.__module__ or "").partition(".")[0] in KNOWN
+
+
 def _key(fn: Callable, rest, about: str) -> str | None:
     """The name of a trace; None where something is not known well enough to tell whether it changed."""
+    if not _known(fn):
+        return None
     written = io.BytesIO()
     try:
         _OnlyKnown(written).dump(rest)
     except (pickle.PicklingError, TypeError, AttributeError):
         return None
-    parts = (f"{fn.__module__}.{fn.__qualname__}", about, _sources())
+    parts = (fn.__module__, fn.__qualname__, about, _sources())
     return hashlib.sha256(repr(parts).encode() + written.getvalue()).hexdigest()[:24]
 
 
@@ -138,12 +160,3 @@ def _sources() -> str:
         digest.update(str(file.relative_to(root)).encode() + file.read_bytes())
     digest.update(repr([importlib.metadata.version(name) for name in LIBRARIES]).encode())
     return digest.hexdigest()
-
-
-def _remember(file: pathlib.Path, content: bytes) -> None:
-    partial = file.with_name(f"{file.name}.{os.getpid()}.part")
-    try:
-        partial.write_bytes(content)
-        partial.replace(file)
-    except OSError:
-        partial.unlink(missing_ok=True)  # a cache that cannot be written costs time, nothing else

@@ -5,7 +5,6 @@ Bad input ends with one line on stderr and status 2; a violation that is left ov
 
 import json
 import math
-import os
 import pathlib
 import sys
 import time
@@ -389,26 +388,13 @@ def _print_feet(columns: dict[str, dict]) -> None:
     Console(width=100).print(table)
 
 
-def _keep_programs() -> None:
-    """Keep programs in the user's cache folder; JAX_COMPILATION_CACHE_DIR= (empty) turns it off."""
-    chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
-    if chosen == "":
-        return
-    from motionfit._traces import keep_programs
-    from motionfit.shape.bodies import cache_folder
-
-    try:
-        keep_programs(pathlib.Path(chosen) if chosen else cache_folder() / "xla")
-    except OSError:
-        return  # a cache that cannot be written costs time, nothing else
-
-
 def main() -> None:
     """Run the command line with its exit statuses."""
+    from motionfit._traces import keep_programs
     from motionfit._types import InputError
 
     try:
-        _keep_programs()
+        keep_programs()
         app()
     except InputError as error:
         sys.stderr.write(f"motionfit: {' '.join(str(error).split())}\n")

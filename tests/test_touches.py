@@ -11,7 +11,7 @@ from motionfit import samples
 from motionfit._motion import host_kinematics
 from motionfit.adapt._limits import SkinLooks
 from motionfit.adapt._touches import KEPT, NEVER, touch_term, touches_of, touching_on
-from motionfit.metrics import insides, posed_vertices
+from motionfit.metrics import insides, posed_vertices, skin_depths
 from motionfit.shape import grow
 from motionfit.shape.pairs import pairs_of
 from motionfit.shape.surface import inside_depths, part_surface
@@ -108,3 +108,39 @@ def test_touches_give_way_where_the_skin_is_out_too_far():
         np.testing.assert_array_equal(looks.eased[:, 0], [0.5, share, share, share, 0.5])
         assert (looks.eased[:, 1] == 0.5).all()
     assert not looks.ease(out, 0.002)
+
+
+def test_no_pose_is_looked_at_twice(heavy, average, clip, monkeypatch):
+    looked = []
+
+    def counting(character, motion, pairs):
+        for frame in insides(character, motion, pairs):
+            looked.append(character.name)
+            yield frame
+
+    for module in ("motionfit.adapt._limits", "motionfit.metrics"):
+        monkeypatch.setattr(f"{module}.insides", counting)
+    average.memo.pop(("shown", PAIRS), None)
+    looks = SkinLooks(clip, heavy, average, PAIRS)
+    count = len(looks.at)
+    assert looked == [average.name] * count
+    first, posed = looks.depths(clip), looks.depths_and_touches(clip)
+    np.testing.assert_array_equal(first, posed)
+    np.testing.assert_array_equal(first, skin_depths(heavy, clip[looks.at], PAIRS).depth)
+    assert looked[count:] == [heavy.name] * count * 2  # ours, and the one to compare with
+    # one frame moves: it alone is looked at, and what touches in the others is not told twice
+    told = {frame: len(touches.pairs) for frame, touches in looks.touches.items()}
+    assert max(told.values()) > 0
+    rotations = np.array(clip.rotations, float)
+    shoulder, turn = heavy.skeleton.joint("left_upper_arm"), Rotation.from_rotvec([0.0, 0.0, 0.2])
+    turned = Rotation.from_quat(rotations[3, shoulder], scalar_first=True) * turn
+    rotations[3, shoulder] = turned.as_quat(scalar_first=True)
+    moved, looked[:] = dataclasses.replace(clip, rotations=rotations), []
+    now = looks.depths_and_touches(moved)
+    assert looked == [heavy.name]
+    assert [i for i in range(count) if (now[i] != first[i]).any()] == [3]
+    assert {f for f, t in looks.touches.items() if len(t.pairs) != told[f]} == {3}
+    # the reference is known for every body after the first
+    looked[:] = []
+    np.testing.assert_array_equal(SkinLooks(clip, grow(heavy, {"arms": 1.1}), average, PAIRS).own, looks.own)
+    assert looked == []

@@ -12,14 +12,14 @@ limb by limb (Quilez' polynomial smooth minimum) and polygonised by marching cub
 
 import hashlib
 import inspect
-import os
-import pathlib
+import io
 import sys
 from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from motionfit._cache import cache_folder, remember
 from motionfit._character import Character
 from motionfit._skeleton import Skeleton
 from motionfit._skinning import Skin
@@ -521,13 +521,6 @@ def _four_influences(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 # --- cache ------------------------------------------------------------------------------------------------------
 
 
-def cache_folder() -> pathlib.Path:
-    """Where motionfit keeps what it can make again: MOTIONFIT_CACHE, else the user's cache folder."""
-    if chosen := os.environ.get("MOTIONFIT_CACHE"):
-        return pathlib.Path(chosen)
-    return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "motionfit"
-
-
 def body(shape: BodyShape, name: str = "body") -> Character:
     """A closed, skinned body of the given measures, from the cache where it was made before."""
     skeleton = skeleton_of(shape)
@@ -541,16 +534,7 @@ def body(shape: BodyShape, name: str = "body") -> Character:
         vertices, faces = _mesh(shape)
         joints, weights = _four_influences(_weights(shape, vertices, skeleton.names))
         arrays = [vertices, faces.astype(np.int32), joints, weights]
-        _remember(file, arrays)
+        packed = io.BytesIO()
+        np.savez_compressed(packed, **dict(zip(("vertices", "faces", "joints", "weights"), arrays, strict=True)))
+        remember(file, packed.getvalue())
     return Character(skeleton, Skin(*arrays), name)
-
-
-def _remember(file: pathlib.Path, arrays: list[np.ndarray]) -> None:
-    partial = file.with_name(f"{file.name}.{os.getpid()}.part")
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with open(partial, "wb") as target:
-            np.savez_compressed(target, **dict(zip(("vertices", "faces", "joints", "weights"), arrays, strict=True)))
-        partial.replace(file)
-    except OSError:
-        partial.unlink(missing_ok=True)  # a cache that cannot be written costs time, nothing else
