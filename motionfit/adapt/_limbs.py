@@ -63,6 +63,7 @@ FEW_FAULTS = 0.005
 DONE = 0.5  # of what the source shows on a body: what a block leaves at most that has done its work
 LESS = 0.8  # of the mean square of all turns: a tenth of the turns themselves
 CLOSER = (0, 1)  # rounds after which more frames are looked at
+LONG = 8192  # frames that the solver sees, from which on blocks are solved one by one: each takes half a gigabyte then
 
 
 class Stage(NamedTuple):
@@ -190,7 +191,8 @@ def limbs(
     settled = known and bool(quiet.all())  # and what is settled was looked at closely then
     for round_ in range(ROUNDS):
         problem = _problem(character, seen, stages, smooth, everything, (at_first, probes), looks)
-        result = fit(problem, _side_by_side(stages), sweeps, correction=correction, progress=told(round_))
+        together = _side_by_side(stages) if seen.padded.frame_count < LONG else [s.block for s in stages]
+        result = fit(problem, together, sweeps, correction=correction, progress=told(round_))
         if not round_ and start is None:
             result = _from_elsewhere(problem, result, stages)
         correction, history = result.correction, [*history, *result.history]

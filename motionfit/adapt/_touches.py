@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
@@ -75,6 +76,7 @@ def touch_term(
 ) -> TouchClearance:  # fmt: skip
     """The rows of a block, whose pairs are `columns`: each of `frames` has the touches of the look nearest to it. The
     frames after them, up to `length`, only fill a bucket."""
+    precision = jax.dtypes.canonicalize_dtype(float)  # the solver's: ten minutes of touches are a gigabyte in double
     at = np.array(sorted(looks) or [0])
     kept = [looks.get(frame, NONE) for frame in at.tolist()]
     kept = [t.only(np.flatnonzero(np.isin(t.pairs, columns))[:KEPT]) for t in kept]
@@ -86,7 +88,8 @@ def touch_term(
         short = [KEPT - len(r) for r in rows]
         full = [np.pad(r, ((0, n), *((0, 0),) * (r.ndim - 1)), constant_values=filling)
                 for r, n in zip(rows, short, strict=True)]  # fmt: skip
-        return np.stack(full)[nearest]
+        kind = precision if full[0].dtype.kind == "f" else full[0].dtype
+        return np.stack(full).astype(kind)[nearest]
 
     limits = by_frame(may, NEVER)
     limits[frames:] = NEVER
