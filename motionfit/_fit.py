@@ -283,6 +283,7 @@ def solve_block(work: Work, solver, max_steps: int, adjoint: optx.AbstractAdjoin
     def joined(rows, frames):
         return jnp.concatenate(rows, axis=1) if rows else jnp.zeros((frames, 0))
 
+    @eqx.filter_jit  # traced once: a solver linearises it for the shapes of its state, and again in its loop
     def residuals(x, args):
         objective, controls, free, fixed = args
         terms = range(len(objective.terms))
@@ -296,6 +297,7 @@ def solve_block(work: Work, solver, max_steps: int, adjoint: optx.AbstractAdjoin
         costs = {k: 0.5 * jnp.sum(jnp.square(r)) for k, r in zip(local + other, rows[0] + rows[1], strict=True)}
         return tuple(joined(r, len(fixed)) for r in rows), tuple(costs[k] for k in terms)
 
+    @eqx.filter_jit
     def energy(x, args):
         objective, controls, free, fixed = args
         kin = objective.kinematics(fixed.at[:, free].set(_signals(controls, x)))

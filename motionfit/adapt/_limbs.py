@@ -149,23 +149,13 @@ def limbs(
     probes = at_first = probe_depths(everything, small)
     before = volume_depths(everything, small, at_first)
     excess = before - own
-    most, kept = excess.max(axis=0), own + allowance(excess, ALLOWED_EXCESS, MARGIN)
-    quiet = most <= TOLERANCE  # a pair that shows no violation is left alone
     looks = None
     if reference is not None and objective == "vertex":
         looks = SkinLooks(source, character, reference, pairs)
         # the frames that were looked at when an adapted clip was made
         first = volume_depths(everything, onto(source, character.skeleton)) - own if known else excess
         looks.look_closer(first.max(axis=1))
-        clear = looks.quiet(looks.depths(small))
-        # near the shoulder the skin alone knows; but where the arm has to turn anyway, and the fields show a little more
-        # than the tolerance, they lose that too
-        phantom = clear & ~quiet & np.array([p.first.endswith("upper_arm") for p in pairs])
-        quiet = (clear & quiet) | phantom
-        arm_of = np.array([p.first.partition("_")[0] if p.block == "arms" else p.block for p in pairs])
-        phantom &= (most <= DOUBTED) & np.isin(arm_of, arm_of[~quiet])
-        quiet &= ~phantom
-        kept = np.where(phantom, own + ENOUGH * TOLERANCE - MARGIN, kept)
+    quiet, kept = _quiet(excess, own, pairs, None if looks is None else looks.quiet(looks.depths(small)))
     if start is not None:
         _check_start(start, seen, pairs)
     allowed = np.where(quiet, np.maximum(before, own), kept)
@@ -246,6 +236,25 @@ def limbs(
     details = {"pairs": [p.name for p in pairs], "frames": seen.frames, "excess_before_m": excess,
                "excess_after_m": best.depths - own, "held_back_m": best.held_back}  # fmt: skip
     return Fit(final, final.apply(base), base, status, tuple(history), best.problem, details)  # pyright: ignore[reportArgumentType]
+
+
+def _quiet(
+    excess: Float[np.ndarray, "frames pairs"], own: Float[np.ndarray, "frames pairs"], pairs: tuple[Pair, ...],
+    clear: Bool[np.ndarray, " pairs"] | None,
+) -> tuple[Bool[np.ndarray, " pairs"], Float[np.ndarray, "frames pairs"]]:  # fmt: skip
+    """The pairs that show no violation, which are left alone, and the depth [m] that may stay in the others. `clear`
+    are those that show none on the skin (None: it was not looked at)."""
+    most, kept = excess.max(axis=0), own + allowance(excess, ALLOWED_EXCESS, MARGIN)
+    quiet = most <= TOLERANCE
+    if clear is None:
+        return quiet, kept
+    # near the shoulder the skin alone knows; but where the arm has to turn anyway, and the fields show a little more
+    # than the tolerance, they lose that too
+    phantom = clear & ~quiet & np.array([p.first.endswith("upper_arm") for p in pairs])
+    quiet = (clear & quiet) | phantom
+    arm_of = np.array([p.first.partition("_")[0] if p.block == "arms" else p.block for p in pairs])
+    phantom &= (most <= DOUBTED) & np.isin(arm_of, arm_of[~quiet])
+    return quiet & ~phantom, np.where(phantom, own + ENOUGH * TOLERANCE - MARGIN, kept)
 
 
 def _from_elsewhere(problem: Problem, result: Fit, stages: list[Stage]) -> Fit:

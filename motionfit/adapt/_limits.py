@@ -39,7 +39,6 @@ def reference_depths(
 class Look(NamedTuple):
     """What one look at the skin showed."""
 
-    pose: bytes  # that was looked at
     depths: Float[np.ndarray, " pairs"]  # [m]
     touches: Touches
 
@@ -50,8 +49,8 @@ class SkinLooks:
     Near the shoulder the skin follows arm and trunk at once, and the fold of the joint is not quite where a field of
     one pose says. So what touches in a look becomes rows for the solver.
 
-    A look takes ten milliseconds or more, so no pose is looked at twice: what a frame showed last is kept here, and
-    what the reference shows is kept with the reference, for the next body and the next round.
+    A look takes ten milliseconds or more, so no pose is looked at twice: what a frame showed is kept here, and what the
+    reference shows is kept with the reference, for the next body.
     """
 
     def __init__(self, clip: Motion, character: Character, reference: Character, pairs: tuple[Pair, ...]):
@@ -61,7 +60,7 @@ class SkinLooks:
         count = min(clip.frame_count, max(LEAST_LOOKS, round(clip.frame_count * LOOK_SHARE)))
         self.at: Int[np.ndarray, " looks"] = np.unique(np.linspace(0, clip.frame_count - 1, count).round().astype(int))
         self.own = self._own(self.at)
-        self.seen: dict[int, Look] = {}  # by frame, the latest
+        self.seen: dict[tuple[int, bytes], Look] = {}  # by frame and pose
         self.touches: dict[int, Touches] = {}
         self.found_in: dict[int, bytes] = {}  # the pose of the latest of them
         self.deepest = np.zeros_like(self.own)  # [m] of excess in any look, where touches were found
@@ -80,38 +79,35 @@ class SkinLooks:
 
     def depths(self, motion: Motion) -> Float[np.ndarray, "looks pairs"]:
         """Depth [m] per look and pair of a motion of the solver's frames."""
-        self._look(motion)
-        return np.array([self.seen[frame].depths for frame in self.at.tolist()])
+        return np.array([look.depths for look in self._look(motion).values()])
 
     def depths_and_touches(self, motion: Motion) -> Float[np.ndarray, "looks pairs"]:
         """The same, and what goes beyond the reference is kept: `touches`, by frame, the latest ones first."""
-        result = self.depths(motion)
-        for frame in self.at.tolist():
-            pose, _, new = self.seen[frame]
+        looked = self._look(motion)
+        for (frame, pose), look in looked.items():
             if self.found_in.get(frame) != pose:
-                self.touches[frame] = new.then(self.touches[frame]) if frame in self.touches else new
+                self.touches[frame] = look.touches.then(self.touches[frame]) if frame in self.touches else look.touches
                 self.found_in[frame] = pose
+        result = np.array([look.depths for look in looked.values()])
         if not self.eased.any():
             self.deepest = np.maximum(self.deepest, result - self.own)
         return result
 
-    def _look(self, motion: Motion) -> None:
-        """Look at the frames whose pose is another than the one seen last."""
+    def _look(self, motion: Motion) -> dict[tuple[int, bytes], Look]:
+        """What each look shows; poses that were seen before are not looked at again."""
         looked = motion[self.at]
-        poses = _poses(looked)
-        new = [i for i, frame in enumerate(self.at.tolist())
-               if frame not in self.seen or self.seen[frame].pose != poses[i]]  # fmt: skip
-        if not new:
-            return
-        looked = looked[np.array(new)]
-        rotations = host_kinematics(looked)[1]
-        for k, vertices, found in insides(self.character, looked, self.pairs):
-            depths = np.zeros(len(self.pairs))
-            for (pair, *_), inside in found.items():
-                depths[pair] = max(depths[pair], inside.depth.max(initial=0.0))
-            i = new[k]
-            touches = touches_of(self.character, rotations[k], vertices, found, self.own[i])
-            self.seen[int(self.at[i])] = Look(poses[i], depths, touches)
+        keys = list(zip(self.at.tolist(), _poses(looked), strict=True))
+        new = np.array([i for i, key in enumerate(keys) if key not in self.seen], int)
+        if len(new):
+            looked = looked[new]
+            rotations = host_kinematics(looked)[1]
+            for k, vertices, found in insides(self.character, looked, self.pairs):
+                depths = np.zeros(len(self.pairs))
+                for (pair, *_), inside in found.items():
+                    depths[pair] = max(depths[pair], inside.depth.max(initial=0.0))
+                touches = touches_of(self.character, rotations[k], vertices, found, self.own[new[k]])
+                self.seen[keys[new[k]]] = Look(depths, touches)
+        return {key: self.seen[key] for key in keys}
 
     def touch_term(self, columns: Int[np.ndarray, " some"], allowed: float, length: int) -> TouchClearance:
         """The touches of some pairs as rows for the solver, up to `allowed` [m] more than the reference shows."""
