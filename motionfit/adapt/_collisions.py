@@ -189,14 +189,10 @@ def _solve(
     at = sampling(motion, groups[0].spacing / 60.0)
     small, count = at.motion(motion), len(at.frames)
     pairs, looks = known.clearance.pairs, skin_looks(clip, character, reference, at)
-    hands = np.array([p.first.endswith("hand") for p in pairs])
     if reference is None:
-        own = known.depths(at.motion(so_far.base))
-        touching = hands & (own > -TOUCH)
+        own, touching = _shown(known, at.motion(so_far.base), None)
     else:
-        origin = at.motion(onto(clip, reference.skeleton))
-        own = known_depths(reference, groups).depths(origin)
-        touching = hands & (skin_gaps_near(reference, origin, pairs, -own, known.on_skin) < TOUCHED)
+        own, touching = _shown(known_depths(reference, groups), at.motion(onto(clip, reference.skeleton)), reference)
     before = known.depths(small)
     # what meets at a joint goes no deeper than it is: on the skin, where that is looked at
     inner, limit = np.array([p.adjacent for p in pairs]), np.maximum(own, 0.0)
@@ -222,16 +218,10 @@ def _solve(
     seen = dataclasses.replace(motion[at.rows], dt=np.asarray(at.dt))
     smooth, history, on_skin = jerk_scale(motion), [], np.zeros((1, 1))
     tries = [(_faults(worst, apart, on_skin), so_far, before, points)]
-    by_set = [[i for i, owner in enumerate(known.clearance.term.field_of) if owner == k]  # pyright: ignore[reportAttributeAccessIssue]
-              for k in range(len(known.clearance.term.fields))]  # fmt: skip  # pyright: ignore[reportAttributeAccessIssue]
     for round_ in range(ROUNDS):
-        smoothed = smooth_floor(allowed, at.dt) - known.radius
-        clear = reduced(known.clearance, score, filled(smoothed, at, 1e3), PROBES)
         # what the fields are off by at a touch is taken off the wish
-        near = np.stack([weight[:, rows].max(axis=1) for rows in by_set], axis=1)
-        wish = np.stack([(gap - off)[:, rows].min(axis=1) for rows in by_set], axis=1)
-        terms = {"collisions": clear, "touch": Robust(SkinContact(clear, filled(wish, at, 1e3), filled(near, at, 0.0))),
-                 "effort": During(Effort(EFFORT), real.astype(float)),
+        clear, touch = _clear_and_touch(known, at, score, allowed, gap - off, weight)
+        terms = {"collisions": clear, "touch": touch, "effort": During(Effort(EFFORT), real.astype(float)),
                  "smoothness": During(Smoothness(smooth), (np.arange(len(at.rows)) < count - 2).astype(float))}  # fmt: skip
         if looks is not None:
             terms["skin"] = looks.touch_term(np.arange(len(PAIRS)), ALLOWED_EXCESS, len(at.rows))
@@ -272,6 +262,32 @@ def _solve(
     left = np.where(inner, 0.0, after - limit).max() > TOLERANCE
     return dataclasses.replace(result, history=(*so_far.history, *history),
                                status="violations_left" if left else so_far.status), told  # fmt: skip
+
+
+def _shown(
+    known: Known, motion: Motion, body: Character | None
+) -> tuple[Float[np.ndarray, "frames rows"], Bool[np.ndarray, "frames rows"]]:
+    """The depths [m] that a clip shows where it comes from, and where a hand touches there: on the skin of the `body`
+    that it was made for, else on the fields."""
+    own, pairs = known.depths(motion), known.clearance.pairs
+    hands = np.array([p.first.endswith("hand") for p in pairs])
+    if body is None:
+        return own, hands & (own > -TOUCH)
+    return own, hands & (skin_gaps_near(body, motion, pairs, -own, known.on_skin) < TOUCHED)
+
+
+def _clear_and_touch(
+    known: Known, at: Sampling, score: Float[np.ndarray, "sets points"], allowed: Float[np.ndarray, "frames rows"],
+    gap: Float[np.ndarray, "frames rows"], weight: Float[np.ndarray, "frames rows"],
+) -> tuple[SkinClearance, Robust]:  # fmt: skip
+    """The rows that keep probes out, up to the depth [m] `allowed`, and those that keep a touch within a `gap` [m], as
+    far as the `weight` says: one of each per field."""
+    clear = reduced(known.clearance, score, filled(smooth_floor(allowed, at.dt) - known.radius, at, 1e3), PROBES)
+    field_of = np.array(known.clearance.term.field_of)  # pyright: ignore[reportAttributeAccessIssue]
+    by_set = [np.flatnonzero(field_of == k) for k in range(len(clear.fields))]
+    near = np.stack([weight[:, rows].max(axis=1) for rows in by_set], axis=1)
+    wish = np.stack([gap[:, rows].min(axis=1) for rows in by_set], axis=1)
+    return clear, Robust(SkinContact(clear, filled(wish, at, 1e3), filled(near, at, 0.0)))
 
 
 def skin_gaps_near(
