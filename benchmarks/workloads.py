@@ -394,13 +394,17 @@ def _process_s(*code: str, **environment: str) -> float:
 
 
 def importing(rounds: int = 5) -> Iterator[Metric]:
-    """`import motionfit` against `import jax, optimistix`, each in a process of its own."""
-    works = (lambda: _process_s("-c", "import motionfit"), lambda: _process_s("-c", "import jax, optimistix"))
-    times = [[work() for work in works] for _ in range(rounds + 1)][1:]  # the first fills the page cache
-    ours, theirs = np.median(times, axis=0)
-    yield seconds("import.motionfit", ours)
+    """`import motionfit`, alone and with all that `adapt` needs, against `import jax, optimistix`, each in a process."""
+    codes = ("import motionfit", "import motionfit; motionfit.adapt", "import jax, optimistix")
+    times = [[_process_s("-c", code) for code in codes] for _ in range(rounds + 1)][
+        1:
+    ]  # the first fills the page cache
+    alone, adapt, theirs = np.median(times, axis=0)
+    yield seconds("import.motionfit", alone)
+    yield seconds("import.motionfit_adapt", adapt)
     yield seconds("import.jax_optimistix", theirs)
-    yield time_ratio("import.over_jax_optimistix", float(np.median([a / b for a, b in times])), 0.25)
+    yield time_ratio("import.over_jax_optimistix", float(np.median([a / c for a, _, c in times])), 0.25)
+    yield time_ratio("import.adapt_over_jax_optimistix", float(np.median([b / c for _, b, c in times])), 0.25)
 
 
 def cold(frame_count: int = FRAMES) -> Iterator[Metric]:

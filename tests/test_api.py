@@ -19,6 +19,15 @@ def test_import_is_light():
     assert found.stdout.strip() == "[]", found.stdout + found.stderr
 
 
+def test_import_alone_is_free_and_names_come_at_first_use():
+    code = ("import sys, motionfit as mf; print('jax' in sys.modules, 'scipy' in sys.modules);"
+            "mf.rotation; print('scipy' in sys.modules, 'adapt' in dir(mf)); mf.adapt; print('scipy' in sys.modules)")  # fmt: skip
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert found.stdout.split() == ["False", "False", "False", "True", "True"], found.stdout + found.stderr
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = mf.no_such_name  # pyright: ignore[reportAttributeAccessIssue]
+
+
 def test_every_public_name_is_there_and_documented():
     for name in mf.__all__:
         assert getattr(mf, name).__doc__, name

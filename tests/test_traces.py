@@ -89,7 +89,8 @@ def test_what_differs_is_traced(folder, arguments):
     finally:
         jax.config.update("jax_numpy_dtype_promotion", "strict")
     assert len(files(folder)) == 2
-    expected = _work(*[jnp.asarray(a, float) if isinstance(a, np.ndarray) else a for a in arguments])
+    module, x, *others = arguments
+    expected = _work(module, jnp.asarray(x, float), *others)
     for result in (found, again):
         assert float(result.total) == pytest.approx(float(expected.total), rel=1e-6)
 

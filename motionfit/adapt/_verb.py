@@ -2,7 +2,7 @@
 
 from types import ModuleType
 
-from motionfit import adapt as recipes
+import motionfit.adapt as recipes
 
 
 class Adapt(ModuleType):
