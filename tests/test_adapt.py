@@ -194,6 +194,16 @@ def test_a_block_chooses_its_probes_by_their_own_part_in_what_is_wrong(heavy):
         )
 
 
+def test_probes_are_scored_by_pieces_as_at_once(heavy, monkeypatch):
+    everything = build_clearance(heavy, pairs_of("arms"))
+    depth = probe_depths(everything, mf.onto(samples.walk(cycles=1), heavy.skeleton)[:30:3])
+    assert depth is not None
+    allowed = np.linspace(-0.01, 0.02, len(depth))[:, None] + np.zeros(len(everything.pairs))
+    whole = support(everything, depth, allowed)
+    monkeypatch.setattr("motionfit.adapt._clearance.MANY", 4)
+    np.testing.assert_allclose(support(everything, depth, allowed), whole, rtol=1e-9)
+
+
 def test_what_touches_at_a_grown_armpit_comes_out(shared_data):
     """Where the fields of one pose see nothing: without the touches 82 % of the frames keep up to 2.4 cm."""
     clip = mf.load_motion(shared_data / "bvh" / "02_01_walk.bvh")[:480]
