@@ -90,11 +90,11 @@ class Fit(eqx.Module):
             }
             for b in self.history
         ]  # fmt: skip
-        signals = np.abs(np.asarray(self.correction.signals())) if self.correction.controls else np.zeros((0, 0))
-        moved = {
-            c.name: {"max_rad": float(signals[:, k].max()), "mean_rad": float(signals[:, k].mean())}
-            for k, c in enumerate(self.correction.controls)
+        signals = {
+            c.name: np.abs(c.signal_on_host(p))
+            for c, p in zip(self.correction.controls, self.correction.points, strict=True)
         }
+        moved = {name: {"max_rad": float(s.max()), "mean_rad": float(s.mean())} for name, s in signals.items()}
         return {"status": self.status, "blocks": blocks, "controls": moved, **self.details}
 
     def __str__(self) -> str:

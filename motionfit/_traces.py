@@ -25,6 +25,7 @@ from motionfit._cache import cache_folder, remember
 from motionfit._types import InputError
 
 LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy")  # what a trace may speak of, besides us
+SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion", "jax_debug_nans")
 KNOWN = {"motionfit", "builtins", *LIBRARIES}
 _folder: pathlib.Path | None = None
 
@@ -50,6 +51,11 @@ def keep_programs(folder: str | os.PathLike | None = None) -> None:
     jax.config.update("jax_compilation_cache_dir", str(place))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def programs_folder() -> pathlib.Path | None:
+    """The folder that `keep_programs` named."""
+    return _folder
 
 
 def kept(fn: Callable, jitted: Callable[[Callable], Callable]) -> Callable:
@@ -148,8 +154,7 @@ def _key(fn: Callable, rest, about: str) -> str | None:
 
 
 def _settings() -> tuple:
-    names = ("jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion", "jax_debug_nans")
-    return (jax.default_backend(), *(getattr(jax.config, name) for name in names))
+    return (jax.default_backend(), *(getattr(jax.config, name) for name in SETTINGS))
 
 
 @functools.cache

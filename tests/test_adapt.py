@@ -12,12 +12,14 @@ from scipy.spatial.transform import Rotation
 import motionfit as mf
 from benchmarks.metrics import compilations
 from motionfit import samples
-from motionfit._motion import joint_angles, resample
+from motionfit._motion import Motion, host_kinematics, joint_angles, resample
 from motionfit.adapt._clearance import build_clearance, probe_depths, support
+from motionfit.adapt._controls import arm_controls
 from motionfit.adapt._limbs import _own_sets, _stages
 from motionfit.metrics import derivative_ratio, skin_depths
 from motionfit.shape.growth import grow
 from motionfit.shape.pairs import pairs_of
+from motionfit.splines import bspline_basis
 
 pytestmark = pytest.mark.slow
 
@@ -202,6 +204,41 @@ def test_probes_are_scored_by_pieces_as_at_once(heavy, monkeypatch):
     whole = support(everything, depth, allowed)
     monkeypatch.setattr("motionfit.adapt._clearance.MANY", 4)
     np.testing.assert_allclose(support(everything, depth, allowed), whole, rtol=1e-9)
+
+
+def test_an_arm_that_points_away_from_the_trunk_keeps_its_axes(average):
+    # a jumping jack: below the shoulder l x v points the other way than above it, and level it is nothing
+    skeleton, frames = average.skeleton, 90
+    shoulder, elbow, chest = (skeleton.joint(r) for r in ("left_upper_arm", "left_forearm", "chest"))
+    rest = Motion(skeleton, np.tile(skeleton.offsets[0], (frames, 1)),
+                  np.tile(skeleton.rest_rotations, (frames, 1, 1)), 1 / 30)  # fmt: skip
+    positions, world = host_kinematics(rest)
+    bone = positions[0, elbow] - positions[0, shoulder]
+    out = np.sign(bone[0]) * np.array([1.0, 0.0, 0.0])
+    height = np.deg2rad(np.linspace(-60.0, 60.0, frames))[:, None]
+    wanted = np.cos(height) * out + np.sin(height) * np.array([0.0, 1.0, 0.002])
+    parent = Rotation.from_quat(world[0, skeleton.parents[shoulder]], scalar_first=True)
+    own = Rotation.from_quat(world[0, shoulder], scalar_first=True)
+    turns = [Rotation.align_vectors(d[None], bone[None])[0] for d in wanted]
+    rotations = np.array(rest.rotations)
+    rotations[:, shoulder] = [(parent.inv() * turn * own).as_quat(scalar_first=True) for turn in turns]
+    motion = dataclasses.replace(rest, rotations=rotations)
+
+    basis = bspline_basis(frames, 1 / 30, 0.1)
+    axes = {c.name: np.asarray(c.drives[0].axis_parent) for c in arm_controls(average, motion, basis)}
+    positions = host_kinematics(motion)[0]
+    hips = positions[:, skeleton.joint("hips")]
+    arm, line, gap = positions[:, elbow] - positions[:, shoulder], positions[:, chest] - hips, positions[:, elbow] - hips
+    away = np.cross(arm, gap - (gap * line).sum(1, keepdims=True) / (line**2).sum(1, keepdims=True) * line)
+    away = parent.inv().apply(away / np.linalg.norm(away, axis=1, keepdims=True))
+    assert away[0] @ away[-1] < -0.9
+    for name in ("left_arm", "left_arm_across", "left_arm_twist"):
+        np.testing.assert_allclose(np.linalg.norm(axes[name], axis=1), 1.0, atol=1e-12)
+        steps = np.linalg.norm(np.diff(axes[name], axis=0), axis=1)
+        assert steps.max() < np.deg2rad(25.0), name
+    ends = np.r_[0:15, frames - 15 : frames]
+    assert ((axes["left_arm"] * away).sum(1)[ends] > 0.98).all()
+    assert np.abs((axes["left_arm"] * axes["left_arm_twist"]).sum(1)).max() < 1e-9
 
 
 def test_what_touches_at_a_grown_armpit_comes_out(shared_data):

@@ -15,6 +15,7 @@ from motionfit._types import InputError
 from motionfit.splines import Basis
 
 UP = np.array([0.0, 1.0, 0.0])
+FAINT = 0.1  # [rad] from an arm's own direction, within which the way from the trunk to it tells nothing
 
 
 def arm_controls(character: Character, motion: Motion, basis: Basis) -> tuple[Control, ...]:
@@ -22,7 +23,9 @@ def arm_controls(character: Character, motion: Motion, basis: Basis) -> tuple[Co
 
     l_i is the *upper arm's* axis, so r_i is perpendicular to it, and v_i the way from the line hips-chest to the
     elbow: a positive angle leads the arm away from the trunk. r_i is fixed during the solve, smoothed over
-    0.15 s, and defined in frames without contact too. r is right to first order; where a bent arm
+    0.15 s, and defined in frames without contact too. Where an arm points straight away from the trunk r_i is
+    undefined, and may be the opposite afterwards: there it turns about the arm from the one to the other, as fast as
+    the smoothing lets it. r is right to first order; where a bent arm
     lies across the belly the shortest way out bends away from it. `left_arm_across` turns about l x r and
     `left_arm_twist` about l: with them every turn of the shoulder can be reached.
     """
@@ -34,8 +37,7 @@ def arm_controls(character: Character, motion: Motion, basis: Basis) -> tuple[Co
         # smoothed in the world: a recording's joint angles are noisy, but cancel along a limb, and an axis that is
         # smooth in the noisy frame of the clavicle would let that noise out
         upper_arm = _smooth(positions[:, elbow] - positions[:, joint], motion)
-        axis = _smooth(np.cross(upper_arm, _away_from_trunk(skeleton, positions, elbow)), motion)
-        axis = _unit(axis - (axis * upper_arm).sum(-1, keepdims=True) * upper_arm)
+        axis = _steady_across(upper_arm, np.cross(upper_arm, _away_from_trunk(skeleton, positions, elbow)), motion)
         for name, about in ((f"{side}_arm", axis), (f"{side}_arm_across", np.cross(upper_arm, axis)),
                             (f"{side}_arm_twist", upper_arm)):  # fmt: skip
             controls.append(Control(name, (Drive(joint, _in_parent(skeleton, world, joint, about), 1.0),), basis))
@@ -164,6 +166,26 @@ def _in_parent(skeleton: Skeleton, rotations_world: np.ndarray, joint: int, axis
 def _smooth(directions: np.ndarray, motion: Motion) -> np.ndarray:
     """Unit directions, low-passed over 0.15 s."""
     return _unit(gaussian_filter1d(_unit(directions), 0.15 / float(motion.dt), axis=0, mode="nearest"))
+
+
+def _steady_across(along: np.ndarray, across: np.ndarray, motion: Motion) -> np.ndarray:
+    """Unit vectors across unit directions `along`: those of `across`, low-passed over 0.15 s, each by its length.
+
+    The low-pass is one of angles about `along`, against a frame that is carried along without twist (Bishop 1975):
+    vectors that come to be opposite would cancel, and what is left of them flips from one frame to the next.
+    """
+    first = np.empty_like(along)
+    carried = across[np.linalg.norm(across, axis=-1).argmax()]
+    for t, direction in enumerate(along):
+        carried = _unit(carried - (carried @ direction) * direction)
+        first[t] = carried
+    second = np.cross(along, first)
+    x, y = (across * first).sum(-1), (across * second).sum(-1)
+    weight = np.maximum(x * x + y * y, FAINT**2)
+    width = 0.15 / float(motion.dt)
+    mean, total = (gaussian_filter1d(v, width, mode="nearest") for v in (weight * np.unwrap(np.arctan2(y, x)), weight))
+    angle = (mean / total)[:, None]
+    return first * np.cos(angle) + second * np.sin(angle)
 
 
 def _away_from_trunk(skeleton, positions: np.ndarray, joint: int) -> np.ndarray:

@@ -1,16 +1,26 @@
 """One clip on many bodies."""
 
+import contextlib
 import os
+import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
+from functools import partial
 from itertools import islice
+
+import jax
 
 from motionfit._character import Character
 from motionfit._fit import Fit
 from motionfit._motion import Motion
+from motionfit._traces import SETTINGS, keep_programs, programs_folder
 from motionfit.adapt._clearance import OBJECTIVES
 from motionfit.adapt._procedure import DEFAULT, adapt
+
+AHEAD = 2  # bodies per worker that wait or are in work: results come in order, and no worker waits for another's
+One = Callable[[Character, Fit | None], Fit]
+_one: One  # of a worker
 
 
 def adapt_many(
@@ -29,28 +39,76 @@ def adapt_many(
         for fit in mf.adapt_many(clip, (mf.shape.grow(body, g) for g in girths), reference=body):
             fit.correction.save(...)
 
-    Both ends are lazy, so memory holds only the bodies in work, `workers` of them (None: one per processor). All
-    share the first one's compiled programs, and each starts from the last result at hand: give bodies that are alike
-    next to each other. `progress(done)` is called after each.
+    `workers` bodies are adapted at once, each in a process of its own that takes most of a gigabyte (None: one per
+    processor; 1: here, one after the other). Both ends are lazy, so memory holds these and a few that wait. All share
+    the first one's compiled programs, and each starts from the last result at hand: give bodies that are alike next to
+    each other. `progress(done)` is called after each.
     """
     workers = workers or os.cpu_count() or 1
+    one = partial(_adapted, clip, reference, tuple(blocks), objective)
+    if workers == 1 or jax.default_backend() != "cpu":  # one accelerator is one worker
+        return _in_turn(one, bodies, progress)
+    return _at_once(one, bodies, workers, progress)
 
-    def one(body: Character, start: Fit | None) -> Fit:
-        fit = adapt(clip, body, reference=reference, blocks=blocks, objective=objective, start=start)
-        if body is not reference:
-            body.memo.clear()  # tables of megabytes, of no use to the next body
-        return fit
+
+def _adapted(
+    clip: Motion,
+    reference: Character | None,
+    blocks: tuple[str, ...],
+    objective: str,
+    body: Character,
+    start: Fit | None,
+) -> Fit:
+    fit = adapt(clip, body, reference=reference, blocks=blocks, objective=objective, start=start)
+    if body is not reference:
+        body.memo.clear()  # tables of megabytes, of no use to the next body
+    return fit
+
+
+def _in_turn(one: One, bodies: Iterable[Character], progress: Callable[[int], None] | None) -> Iterator[Fit]:
+    last = None
+    for done, body in enumerate(bodies, 1):
+        last = one(body, last)
+        if progress is not None:
+            progress(done)
+        yield last
+
+
+def _at_once(
+    one: One, bodies: Iterable[Character], workers: int, progress: Callable[[int], None] | None
+) -> Iterator[Fit]:
+    """In processes, since threads would wait for each other: libigl holds Python's lock, and half of an adaptation are
+    looks at the skin."""
+    from loky import ProcessPoolExecutor  # unlike the standard library's, it asks no script for a guard of __main__
 
     waiting, last, done = iter(bodies), None, 0
     running: deque[Future[Fit]] = deque()
-    with ThreadPoolExecutor(workers) as pool:
+    with contextlib.ExitStack() as stack:
+        # what the first one compiles, the others find in a folder
+        folder = programs_folder() or stack.enter_context(tempfile.TemporaryDirectory(prefix="motionfit-"))
+        settings = {name: getattr(jax.config, name) for name in SETTINGS}
+        pool = ProcessPoolExecutor(workers, initializer=_begin, initargs=(one, str(folder), settings))
+        stack.callback(pool.shutdown, kill_workers=True)  # also where nobody wants the rest
         while True:
             # the first alone: it compiles for all
-            for body in islice(waiting, (workers if done else 1) - len(running)):
-                running.append(pool.submit(one, body, last))
+            for body in islice(waiting, (AHEAD * workers if done else 1) - len(running)):
+                bare = jax.tree.map(lambda x: x, body)  # without what was fitted to it
+                running.append(pool.submit(_run, bare, last))
             if not running:
                 return
             last, done = running.popleft().result(), done + 1
             if progress is not None:
                 progress(done)
             yield last
+
+
+def _begin(one: One, folder: str, settings: dict) -> None:
+    global _one
+    for name, value in settings.items():
+        jax.config.update(name, value)
+    keep_programs(folder)
+    _one = one
+
+
+def _run(body: Character, start: Fit | None) -> Fit:
+    return _one(body, start)

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 
 from motionfit._character import Character
 from motionfit._motion import Motion, bucket, continued, forward_kinematics
+from motionfit._onto import onto
 from motionfit._programs import program
 from motionfit._types import InputError
 from motionfit.balance import Soles, ZmpDistance, balance_measures, sole_boxes, zmp_distance
@@ -61,7 +62,7 @@ def weighed(body: Character) -> tuple[Masses, Soles]:
 
 def _plants(character: Character, motion: Motion) -> Footplants | None:
     try:
-        return detect(find_sole(character), motion)[0]
+        return detect(find_sole(character), onto(motion, character.skeleton))[0]
     except InputError:
         return None
 
