@@ -1,5 +1,7 @@
 """One clip on many bodies."""
 
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
@@ -29,20 +31,43 @@ def test_each_starts_from_the_last_and_comes_in_order(walk, average):
     assert all(np.maximum(f.details["excess_after_m"], 0).max() < 0.01 for f in fits)
 
 
-def test_bodies_are_made_when_they_are_needed(walk, average):
-    made: list[float] = []
+def test_bodies_are_made_when_they_are_needed(walk, average, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    made: list[mf.Character] = []
 
     def bodies():
-        for girth in np.linspace(1.0, 1.1, 6):
-            made.append(girth)
-            yield mf.shape.grow(average, {"arms": float(girth)})
+        for girth in np.linspace(1.2, 1.4, 8):
+            made.append(mf.shape.grow(average, {"arms": float(girth), "trunk": float(girth)}))
+            yield made[-1]
 
     fits = mf.adapt_many(walk, bodies(), reference=average, workers=2, **ARMS)
-    next(fits)
+    first = next(fits)
     assert len(made) == 1
-    next(fits)
-    assert len(made) <= 3
-    assert len(list(fits)) == 4
+    second = next(fits)
+    assert len(made) <= 5
+    assert len(list(tmp_path.glob("motionfit-*/*.trace"))) > 0  # what the workers share
+    every = [first, second, *fits]
+    assert len(every) == len(made) == 8
+    for fit, body in zip(every, made, strict=True):
+        assert np.array_equal(fit.problem.character.skin.vertices_bind, body.skin.vertices_bind)
+        assert np.maximum(fit.details["excess_after_m"], 0).max() < 0.01
+    assert not list(tmp_path.glob("motionfit-*"))
+
+
+def test_a_script_needs_no_guard_and_an_error_names_itself(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import motionfit as mf\n"
+        "from motionfit import samples\n"
+        "average = mf.load_character('builtin:average')\n"
+        "try:\n"
+        "    list(mf.adapt_many(samples.walk(cycles=1), [average], reference=average, blocks=('wings',), workers=2))\n"
+        "except mf.InputError as error:\n"
+        "    print(error)\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "wings" in done.stdout and len(done.stdout.splitlines()) == 1
 
 
 def test_a_start_of_another_clip_is_refused(walk, average):
