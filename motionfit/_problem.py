@@ -76,7 +76,7 @@ class Energy(eqx.Module):
 
 
 class During(Term):
-    """Another term, in some frames only: its rows are multiplied by the mask (0..1 per frame)."""
+    """Another term, in some frames only, or more in some: its rows are multiplied by the mask (one number per frame)."""
 
     term: Term
     mask: Float[AnyArray, " frames"]

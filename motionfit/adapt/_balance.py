@@ -15,7 +15,7 @@ from motionfit._control import Control, Correction
 from motionfit._fit import Block, Fit, fit
 from motionfit._motion import Motion, continued, host_kinematics
 from motionfit._onto import onto
-from motionfit._problem import During, Problem
+from motionfit._problem import During, Problem, Robust
 from motionfit._skeleton import SIDES
 from motionfit._types import InputError
 from motionfit.adapt._clearance import build_clearance, volume_depths
@@ -27,7 +27,7 @@ from motionfit.adapt._standing import distances, weighed
 from motionfit.balance import WINDOW, Soles, ZmpDistance
 from motionfit.feet._leg import Leg, find_legs, turn_legs
 from motionfit.feet._remove import detect_footplants
-from motionfit.metrics import TOLERANCE, derivative_ratio
+from motionfit.metrics import TOLERANCE
 from motionfit.shape.mass import Masses
 from motionfit.shape.pairs import PAIRS
 from motionfit.terms.balance import Standing, ZmpMargin
@@ -45,6 +45,9 @@ MOST_JERK = 1.04  # ratio to that of the motion before the block
 PASS_OVER = 0.08  # [s] within which the weight goes from one foot to the other
 STRETCH = 0.998  # of a leg's length, as far as it may be stretched: straight legs leave no way to shift the hips
 ROUNDS = 5
+AROUND = 0.1  # [s]
+FADE, FADES = 0.25, 8  # what goes of a lean at once where it sinks in or is jerky, and how often
+OUTLIER = 5.0  # [cm] beyond its threshold, from which on a frame counts by its distance, not by the square of that
 
 
 class _Stance(NamedTuple):
@@ -108,51 +111,93 @@ def balance(
     limit = (scale * threshold + ALLOWED_EXCESS)[at.frames]
     points = Correction.zero(tuple(at.control(c) for c in controls))
     smooth = JERK_SHARE * max(_jerk(motion), LEAST_JERK) / LEVER
-    effort, history = EFFORT, []
-    real = np.arange(len(at.rows)) < len(at.frames)
+    held = smoother = np.ones(len(at.frames))
+    best, history = None, []
+
+    def leaned(points: Correction, part) -> _Leaned:
+        some = _stood(so_far, controls, at, points, feet, share, part)
+        after = _distance(character, some.motion, stance, planted)
+        return _Leaned(some, after, _mean(after), points, part, np.logical_or.reduceat(_jerky(some.motion, motion), at.frames), sinks(some.motion))  # fmt: skip
+
     for _ in range(ROUNDS):
         zmp = eqx.tree_at(lambda z: z.threshold, term, _padded(limit, at, 0.0))
-        terms = {"balance": Standing(zmp, feet, home, share[at.rows]),
-                 "effort": During(Effort(effort), real.astype(float)),
-                 "smoothness": During(Smoothness(smooth), real.astype(float))}  # fmt: skip
+        terms = {"balance": Robust(Standing(zmp, feet, home, share[at.rows]), OUTLIER),
+                 "effort": During(Effort(EFFORT), _padded(held, at, 0.0)),
+                 "smoothness": During(Smoothness(smooth), _padded(smoother, at, 0.0))}  # fmt: skip
         problem = Problem(character, seen, terms, points.controls)
         solved = fit(problem, (Block("balance", tuple(c.name for c in controls), max_steps=24, tolerance=1e-3),),
                      correction=points)  # fmt: skip
         points, history = solved.correction, [*history, *solved.history]
-        result = _stood(so_far, controls, at, points, feet, share)
-        after = _distance(character, result.motion, stance, planted)
-        jerk = derivative_ratio(result.motion, motion, 3) or 1.0
-        sunk = sinks(result.motion)
-        if _mean(after) <= wanted + MEAN_ENOUGH and jerk <= MOST_JERK and not sunk:
+        whole = leaned(points, np.ones(at.whole.count))
+        clean = _cleaned(whole, leaned, at)
+        gained = np.inf if best is None else best.mean - clean.mean
+        best = clean if best is None or gained > 0.0 else best
+        if best.mean <= wanted + MEAN_ENOUGH or gained < MEAN_ENOUGH:
             break
-        if jerk > MOST_JERK:
-            smooth *= 0.5
-        if sunk:
-            effort *= 0.5
-        if _mean(after) > wanted + MEAN_ENOUGH:
-            left = np.where(after.supported, np.asarray(after.outside) - scale * threshold, 0.0)[at.frames]
+        smoother = smoother * (1.0 + _around(whole.jerky, at.dt))
+        held = held * (1.0 + _around(whole.sunk, at.dt))
+        if whole.mean > wanted + MEAN_ENOUGH:
+            left = np.where(whole.after.supported, np.asarray(whole.after.outside) - scale * threshold, 0.0)[at.frames]
             limit = limit - np.maximum(left, 0.0)
-
-    def stood(part: float) -> tuple[Fit, ZmpDistance]:
-        some = _stood(so_far, controls, at, points, feet, share, part)
-        return some, _distance(character, some.motion, stance, planted)
-
-    failed = sunk or jerk > MOST_JERK
-    for part in (0.75, 0.5, 0.25, 0.0) if failed else ():
-        # rather less balanced than a part in another, or a jerk
-        result, after = stood(part)
-        if not sinks(result.motion) and (derivative_ratio(result.motion, motion, 3) or 1.0) <= MOST_JERK:
-            break
-    if not failed and _mean(after) < CARTOON * wanted:
+    assert best is not None
+    if best.mean < CARTOON * wanted:
         # the thresholds hold what was farther and let be what was nearer, so that the mean ends under the source's:
         # what is more than was asked for is given back
-        part = _crossing(lambda part: _mean(stood(part)[1]) - wanted)
-        some, nearer = stood(part)
-        if not sinks(some.motion):
-            result, after = some, nearer
-    reached = _mean(after) <= wanted + MOST_LEFT
-    return done(dataclasses.replace(result, history=(*so_far.history, *history),
-                                    status=so_far.status if reached else "violations_left"), after)  # fmt: skip
+        found = best
+        part = _crossing(lambda part: leaned(found.points, part * found.part).mean - wanted)
+        some = leaned(found.points, part * found.part)
+        best = found if some.sunk.any() else some
+    reached = best.mean <= wanted + MOST_LEFT
+    return done(dataclasses.replace(best.result, history=(*so_far.history, *history),
+                                    status=so_far.status if reached else "violations_left"), best.after)  # fmt: skip
+
+
+class _Leaned(NamedTuple):
+    """A part of a lean, 0 to 1 per control point, put on the motion: how balanced it is in the mean [m], and which of
+    the frames seen are too jerky or sink in."""
+
+    result: Fit
+    after: ZmpDistance
+    mean: float
+    points: Correction
+    part: Float[np.ndarray, " points"]
+    jerky: Bool[np.ndarray, " seen"]
+    sunk: Bool[np.ndarray, " seen"]
+
+    @property
+    def wrong(self) -> Bool[np.ndarray, " seen"]:
+        return self.jerky | self.sunk
+
+
+def _cleaned(whole: _Leaned, leaned: Callable[[Correction, np.ndarray], _Leaned], at: Sampling) -> _Leaned:
+    """As much of a lean as sinks in nowhere and is not jerky: rather less balanced than that. First there is less of it
+    around the frames where it is so, then everywhere."""
+    some = whole
+    for _ in range(FADES):
+        if not some.wrong.any():
+            return some
+        some = leaned(whole.points, some.part * (1.0 - FADE * _of_points(_around(some.wrong, at.dt), at)))
+    faded = some.part
+    for part in (0.75, 0.5, 0.25, 0.0):
+        if not some.wrong.any():
+            break
+        some = leaned(whole.points, part * faded)
+    return some
+
+
+def _around(sunk: Bool[np.ndarray, " seen"], dt: float) -> Float[np.ndarray, " seen"]:
+    """1 in some frames, and smoothly to 0 around them: as far as a spline takes its neighbours along."""
+    width = max(1, round(AROUND / dt))
+    return gaussian_filter1d(maximum_filter1d(sunk.astype(float), 2 * width + 1), width / 2, mode="nearest")
+
+
+def _of_points(rows: Float[np.ndarray, " seen"], at: Sampling) -> Float[np.ndarray, " points"]:
+    """Per control point the most of the frames that it moves."""
+    first, width = np.asarray(at.basis.first)[: len(rows)], np.shape(at.basis.values)[1]
+    result = np.zeros(at.basis.count)
+    for k in range(width):
+        np.maximum.at(result, first + k, rows)
+    return result[: at.whole.count]
 
 
 def _padded(rows: np.ndarray, at: Sampling, value) -> np.ndarray:
@@ -191,6 +236,21 @@ def _share(planted: Bool[np.ndarray, "frames 2"], dt: float) -> Float[np.ndarray
     return weight / weight.sum(axis=1, keepdims=True)
 
 
+def _jerky(motion: Motion, before: Motion) -> Bool[np.ndarray, " frames"]:
+    """The frames without whose jerk a motion would have no more than `MOST_JERK` times that of the one before; none
+    where it has not."""
+    now, was = (np.zeros(m.frame_count) for m in (motion, before))
+    if motion.frame_count > 3:
+        for row, m in ((now, motion), (was, before)):
+            row[1:-2] = np.linalg.norm(np.diff(host_kinematics(m)[0], 3, axis=0), axis=-1).mean(axis=1)
+    more = now - was
+    order = np.argsort(-more)
+    left = more.sum() - np.concatenate([[0.0], np.cumsum(more[order])])
+    result = np.zeros(len(more), bool)
+    result[order[: int((left > (MOST_JERK - 1.0) * was.sum()).sum())]] = True
+    return result
+
+
 def _jerk(motion: Motion) -> float:
     """Mean jerk [m/s^3] of the joints, noise left out."""
     if motion.frame_count < 4:
@@ -200,21 +260,22 @@ def _jerk(motion: Motion) -> float:
 
 
 def _sinking(clip: Motion, character: Character, reference: Character | None, so_far: Motion, at: Sampling):
-    """Says of a motion whether some pair shows nearly as much as the tolerance, and more than before the block."""
+    """Says of a motion in which of the frames seen some pair shows nearly as much as the tolerance, and more than before
+    the block."""
     clearance = build_clearance(character, PAIRS)
     limit = reference_depths(clip[at.frames], character, reference, PAIRS)
     before = volume_depths(clearance, at.motion(so_far)) - limit
 
-    def sinks(motion: Motion) -> bool:
+    def sinks(motion: Motion) -> Bool[np.ndarray, " seen"]:
         now = volume_depths(clearance, at.motion(motion)) - limit
-        return bool((now > np.maximum(before + 0.001, NEARLY * TOLERANCE)).any())
+        return np.asarray((now > np.maximum(before + 0.001, NEARLY * TOLERANCE)).any(axis=1))
 
     return sinks
 
 
 def _stood(
     so_far: Fit, controls: tuple[Control, ...], at: Sampling, points: Correction, feet: tuple[int, ...],
-    share: Float[np.ndarray, "frames 2"], part: float = 1.0,
+    share: Float[np.ndarray, "frames 2"], part: float | Float[np.ndarray, " points"] = 1.0,
 ) -> Fit:  # fmt: skip
     """The block's controls, or a part of them, on top of the fit so far, with every foot where it was: the root moves,
     the legs follow."""
