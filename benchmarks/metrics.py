@@ -248,13 +248,17 @@ def reset_peak_memory() -> None:
         pass
 
 
-def peak_memory_gib() -> float:
-    """The most memory [GiB] that this process held since `reset_peak_memory`."""
+def peak_memory_gib(children: bool = False) -> float:
+    """The most memory [GiB] that this process held since `reset_peak_memory`; with its `children`, those that are alive
+    and their own peaks counted, an upper bound."""
     try:
-        found = re.search(r"VmHWM:\s*(\d+) kB", pathlib.Path("/proc/self/status").read_text())
-        assert found is not None
-        return int(found[1]) / 2**20
-    except (OSError, AssertionError):
+        processes = ["self"]
+        if children:
+            lists = pathlib.Path("/proc/self/task").glob("*/children")
+            processes += [pid for file in lists for pid in file.read_text().split()]
+        found = [re.search(r"VmHWM:\s*(\d+) kB", pathlib.Path(f"/proc/{p}/status").read_text()) for p in processes]
+        return sum(int(f[1]) for f in found if f is not None) / 2**20
+    except OSError:
         import resource
 
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20

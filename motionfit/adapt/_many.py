@@ -2,12 +2,14 @@
 
 import contextlib
 import os
+import sys
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future
 from functools import partial
 from itertools import islice
+from operator import length_hint
 
 import jax
 
@@ -44,7 +46,7 @@ def adapt_many(
     the first one's compiled programs, and each starts from the last result at hand: give bodies that are alike next to
     each other. `progress(done)` is called after each.
     """
-    workers = workers or os.cpu_count() or 1
+    workers = min(workers or os.cpu_count() or 1, length_hint(bodies) or sys.maxsize)
     one = partial(_adapted, clip, reference, tuple(blocks), objective)
     if workers == 1 or jax.default_backend() != "cpu":  # one accelerator is one worker
         return _in_turn(one, bodies, progress)
