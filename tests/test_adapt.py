@@ -228,7 +228,11 @@ def test_an_arm_that_points_away_from_the_trunk_keeps_its_axes(average):
     axes = {c.name: np.asarray(c.drives[0].axis_parent) for c in arm_controls(average, motion, basis)}
     positions = host_kinematics(motion)[0]
     hips = positions[:, skeleton.joint("hips")]
-    arm, line, gap = positions[:, elbow] - positions[:, shoulder], positions[:, chest] - hips, positions[:, elbow] - hips
+    arm, line, gap = (
+        positions[:, elbow] - positions[:, shoulder],
+        positions[:, chest] - hips,
+        positions[:, elbow] - hips,
+    )
     away = np.cross(arm, gap - (gap * line).sum(1, keepdims=True) / (line**2).sum(1, keepdims=True) * line)
     away = parent.inv().apply(away / np.linalg.norm(away, axis=1, keepdims=True))
     assert away[0] @ away[-1] < -0.9

@@ -1,5 +1,7 @@
 """The balance block: the zero-moment point comes back to where it was allowed, the feet stay, and quiet clips too."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -7,8 +9,10 @@ import motionfit as mf
 from motionfit import samples
 from motionfit._control import Control, Correction, Drive
 from motionfit._motion import Motion, continued, host_kinematics, joint_angles, padded
+from motionfit.adapt._balance import _cleaned, _jerky, _Leaned
 from motionfit.adapt._controls import lean_controls
 from motionfit.adapt._record import recorded
+from motionfit.adapt._sampling import sampling
 from motionfit.metrics import derivative_ratio
 from motionfit.splines import bspline_basis, per_frame
 from motionfit.terms import JointTracking, Standing
@@ -175,3 +179,47 @@ def test_a_continued_clip_goes_on_at_its_speed(average):
     steps = np.linalg.norm(np.diff(places, axis=0), axis=-1)
     np.testing.assert_allclose(steps[29], steps[28], rtol=0.05, atol=1e-3)
     np.testing.assert_array_equal(continued(walk, 30).rotations, padded(walk, 30).rotations)
+
+
+def test_a_lean_fades_where_it_is_wrong_and_stays_elsewhere():
+    at = sampling(samples.walk(cycles=3))
+    seen = len(at.frames)
+    tried = []
+
+    def leaned(points, part):
+        tried.append(part)
+        # a frame in the middle sinks in with more than half of the lean
+        values = np.asarray(at.whole(part))[at.frames]
+        sunk = (np.arange(seen) == seen // 2) & (values > 0.5)
+        return _Leaned(None, None, 0.0, points, part, np.zeros(seen, bool), sunk)  # pyright: ignore[reportArgumentType]
+
+    whole = leaned(None, np.ones(at.whole.count))
+    clean = _cleaned(whole, leaned, at)
+    assert whole.sunk.any() and not clean.wrong.any() and len(tried) > 2
+    knot = int(np.asarray(at.basis.first)[seen // 2]) + 1
+    assert clean.part[knot] <= 0.5
+    assert (clean.part[: knot - 6] == 1.0).all() and (clean.part[knot + 7 :] == 1.0).all()
+    # what is wrong whatever is taken is not leaned at all
+    hopeless = _cleaned(whole, lambda points, part: whole._replace(part=part), at)
+    assert (hopeless.part == 0.0).all()
+
+
+def test_the_jerky_frames_are_those_without_which_there_is_no_more_jerk_than_allowed(average):
+    walk = mf.onto(samples.walk(cycles=2), average.skeleton)
+    assert not _jerky(walk, walk).any()
+    root = np.array(walk.root, float)
+    root[60] += [0.0, 0.02, 0.0]  # a jolt
+    jolted = dataclasses.replace(walk, root=root)
+    found = np.flatnonzero(_jerky(jolted, walk))
+    assert len(found) and set(found) <= set(range(57, 63))
+    assert not _jerky(walk[:3], walk[:3]).any()
+
+
+@pytest.mark.slow
+def test_hops_of_a_heavy_body_are_balanced_where_they_can_be(shared_data):
+    # metres away next to flight: squares of that left all other frames as they were, and one that sinks in gave all up
+    clip = mf.load_motion(shared_data / "bvh/131_03_start_hop_stop.bvh")[411:891]
+    body, reference = (mf.load_character(shared_data / f"characters/{n}.glb") for n in ("heavy_male", "avg_male"))
+    told = mf.adapt(clip, body, reference=reference).details["balance"]
+    assert told["zmp_distance_before_m"] > 0.2
+    assert told["zmp_distance_after_m"] < 0.12  # 0.05 to 0.08, as the rounding goes; the source: 0.051

@@ -47,7 +47,7 @@ STRETCH = 0.998  # of a leg's length, as far as it may be stretched: straight le
 ROUNDS = 5
 AROUND = 0.1  # [s]
 FADE, FADES = 0.25, 8  # what goes of a lean at once where it sinks in or is jerky, and how often
-OUTLIER = 5.0  # [cm] beyond its threshold, from which on a frame counts by its distance, not by the square of that
+OUTLIER = 8.0  # [cm] beyond its threshold, from which on a frame counts by its distance, not by the square of that
 
 
 class _Stance(NamedTuple):
@@ -136,9 +136,9 @@ def balance(
             break
         smoother = smoother * (1.0 + _around(whole.jerky, at.dt))
         held = held * (1.0 + _around(whole.sunk, at.dt))
-        if whole.mean > wanted + MEAN_ENOUGH:
-            left = np.where(whole.after.supported, np.asarray(whole.after.outside) - scale * threshold, 0.0)[at.frames]
-            limit = limit - np.maximum(left, 0.0)
+        left = np.where(whole.after.supported, np.asarray(whole.after.outside) - scale * threshold, 0.0)[at.frames]
+        # what fades in some frames is made up for in others
+        limit = limit - (np.maximum(left, 0.0) if whole.mean > wanted + MEAN_ENOUGH else clean.mean - wanted)
     assert best is not None
     if best.mean < CARTOON * wanted:
         # the thresholds hold what was farther and let be what was nearer, so that the mean ends under the source's:
