@@ -33,6 +33,7 @@ def test_each_starts_from_the_last_and_comes_in_order(walk, average):
 
 def test_bodies_are_made_when_they_are_needed(walk, average, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr("motionfit._traces._folder", None)  # another test may have named one
     made: list[mf.Character] = []
 
     def bodies():

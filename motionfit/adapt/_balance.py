@@ -15,7 +15,7 @@ from motionfit._control import Control, Correction
 from motionfit._fit import Block, Fit, fit
 from motionfit._motion import Motion, continued, host_kinematics
 from motionfit._onto import onto
-from motionfit._problem import During, Problem, Robust
+from motionfit._problem import During, Problem
 from motionfit._skeleton import SIDES
 from motionfit._types import InputError
 from motionfit.adapt._clearance import build_clearance, volume_depths
@@ -44,10 +44,10 @@ LEVER = 0.9  # [m] ankle to hip
 MOST_JERK = 1.04  # ratio to that of the motion before the block
 PASS_OVER = 0.08  # [s] within which the weight goes from one foot to the other
 STRETCH = 0.998  # of a leg's length, as far as it may be stretched: straight legs leave no way to shift the hips
-ROUNDS = 5
+ROUNDS, PATIENCE = 5, 2  # rounds at most, and rounds without a better result
 AROUND = 0.1  # [s]
 FADE, FADES = 0.25, 8  # what goes of a lean at once where it sinks in or is jerky, and how often
-OUTLIER = 8.0  # [cm] beyond its threshold, from which on a frame counts by its distance, not by the square of that
+OUTLIER = 0.05  # [m] beyond its threshold, from which on a frame counts by its distance, not by the square of that
 
 
 class _Stance(NamedTuple):
@@ -112,7 +112,7 @@ def balance(
     points = Correction.zero(tuple(at.control(c) for c in controls))
     smooth = JERK_SHARE * max(_jerk(motion), LEAST_JERK) / LEVER
     held = smoother = np.ones(len(at.frames))
-    best, history = None, []
+    best, after, idle, history = None, before, 0, []
 
     def leaned(points: Correction, part) -> _Leaned:
         some = _stood(so_far, controls, at, points, feet, share, part)
@@ -121,7 +121,10 @@ def balance(
 
     for _ in range(ROUNDS):
         zmp = eqx.tree_at(lambda z: z.threshold, term, _padded(limit, at, 0.0))
-        terms = {"balance": Robust(Standing(zmp, feet, home, share[at.rows]), OUTLIER),
+        # next to flight the point is metres away: squares of that would leave all other frames as they are
+        far = np.maximum(np.asarray(after.outside)[at.frames] - limit, 1e-9)
+        counts = _padded(np.sqrt(np.minimum(OUTLIER / far, 1.0)), at, 0.0)
+        terms = {"balance": During(Standing(zmp, feet, home, share[at.rows]), counts),
                  "effort": During(Effort(EFFORT), _padded(held, at, 0.0)),
                  "smoothness": During(Smoothness(smooth), _padded(smoother, at, 0.0))}  # fmt: skip
         problem = Problem(character, seen, terms, points.controls)
@@ -129,16 +132,17 @@ def balance(
                      correction=points)  # fmt: skip
         points, history = solved.correction, [*history, *solved.history]
         whole = leaned(points, np.ones(at.whole.count))
+        after = whole.after
         clean = _cleaned(whole, leaned, at)
-        gained = np.inf if best is None else best.mean - clean.mean
-        best = clean if best is None or gained > 0.0 else best
-        if best.mean <= wanted + MEAN_ENOUGH or gained < MEAN_ENOUGH:
+        idle = 0 if best is None or clean.mean < best.mean - MEAN_ENOUGH else idle + 1
+        best = clean if best is None or clean.mean < best.mean else best
+        if best.mean <= wanted + MEAN_ENOUGH or idle == PATIENCE:
             break
         smoother = smoother * (1.0 + _around(whole.jerky, at.dt))
         held = held * (1.0 + _around(whole.sunk, at.dt))
-        left = np.where(whole.after.supported, np.asarray(whole.after.outside) - scale * threshold, 0.0)[at.frames]
-        # what fades in some frames is made up for in others
-        limit = limit - (np.maximum(left, 0.0) if whole.mean > wanted + MEAN_ENOUGH else clean.mean - wanted)
+        if whole.mean > wanted + MEAN_ENOUGH:
+            left = np.where(whole.after.supported, np.asarray(whole.after.outside) - scale * threshold, 0.0)[at.frames]
+            limit = limit - np.maximum(left, 0.0)
     assert best is not None
     if best.mean < CARTOON * wanted:
         # the thresholds hold what was farther and let be what was nearer, so that the mean ends under the source's:
