@@ -117,7 +117,8 @@ def balance(
     def leaned(points: Correction, part) -> _Leaned:
         some = _stood(so_far, controls, at, points, feet, share, part)
         after = _distance(character, some.motion, stance, planted)
-        return _Leaned(some, after, _mean(after), points, part, np.logical_or.reduceat(_jerky(some.motion, motion), at.frames), sinks(some.motion))  # fmt: skip
+        jerky = np.logical_or.reduceat(_jerky(some.motion, motion), at.frames)
+        return _Leaned(some, after, _mean(after), points, part, jerky, sinks(some.motion))
 
     for _ in range(ROUNDS):
         zmp = eqx.tree_at(lambda z: z.threshold, term, _padded(limit, at, 0.0))
