@@ -22,6 +22,7 @@ from motionfit.adapt._clearance import (
     build_clearance,
     probe_depths,
     reduced,
+    signed_depths,
     support,
     volume_depths,
 )
@@ -189,12 +190,15 @@ def limbs(
         moved = result.motion[np.arange(small.frame_count)]
         used = np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
         probes = probe_depths(everything, moved)
-        after = volume_depths(everything, moved, probes)
+        signed = signed_depths(everything, moved, probes)
+        after = np.maximum(signed, 0.0)
         if looks is None:
             left = np.where(quiet, 0.0, after - own)
         else:
-            if round_ in CLOSER and not settled:
+            if round_ == CLOSER[0] and not settled:
                 looks.look_closer((after - own).max(axis=1))
+            if round_ == CLOSER[1] and not settled:
+                looks.look_between(looks.depths(moved), signed - own)
             on_skin = looks.depths_and_touches(moved)
             # what the first looks missed
             woken = quiet & ~looks.quiet(on_skin)

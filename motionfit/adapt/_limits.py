@@ -18,7 +18,12 @@ from motionfit.terms.penetration import TouchClearance
 
 LEAST_LOOKS, LOOK_SHARE = 16, 1 / 15  # looks at the skin: at least, and per frame that the solver sees
 NEARLY = 0.9  # of TOLERANCE: what a result may show, since between two looks there may be a little more
-LOOKS_APART = 2  # [frames] that two looks are at least apart
+LOOKS_APART = 1  # frames between two looks, at least
+OPENED = 0.5  # of a fold's depth: what is left of it at most
+BLIND = 0.015  # [m] of skin inside a part that its field may not show, where hips or shoulders are bent far
+DOUBT = 3.0  # of what a field shows more between two looks: how far it may be wrong there, up to BLIND
+HIDDEN = 0.25  # of TOLERANCE: what may be there besides what the looks have shown
+SAFE = 0.8  # of TOLERANCE: what may be between two looks without a third one there
 ENOUGH = 0.7  # of TOLERANCE: what a look may still show
 FARTHER = 0.005  # [m] out than need be, from which on touches are eased
 EASES = (0.5, 0.25, 0.0)  # of what was found, one after the other
@@ -132,12 +137,35 @@ class SkinLooks:
         self.eased = np.where(sinks, less, self.eased)
         return wanted
 
-    def look_closer(self, risk: Float[np.ndarray, " frames"]) -> None:
+    def look_between(self, seen: Float[np.ndarray, "looks pairs"], signed: Float[np.ndarray, "frames pairs"]) -> None:
+        """Look at more frames from now on: those that may show more than the looks on both sides of them have `seen`.
+
+        Where a fold opens on the reference from the one look to the other, it may open on this body later, or earlier:
+        as much as one look showed may be there, and as little allowed as in the other. Else the fields tell what there
+        is besides, by their `signed` excess [m], negative where there is a gap. Of parts that were apart in both looks
+        it tells how near they came; where it does not rise, the looks have shown it right.
+        """
+        after = np.minimum(np.maximum(np.searchsorted(self.at, self.frames, side="right"), 1), len(self.at) - 1)
+        before = np.maximum(after - 1, 0)
+
+        def on_both_sides(x):
+            return np.minimum(x[before], x[after]), np.maximum(x[before], x[after])
+
+        (_, most), (least, own), (_, shown) = map(on_both_sides, (seen, self.own, np.maximum(seen - self.own, 0.0)))
+        rise = np.maximum(signed - on_both_sides(signed[self.at])[1], 0.0)
+        risk = np.where(least < OPENED * own, most - least, shown) + rise
+        risk = np.where(most > 0.0, risk, signed + np.minimum(BLIND, DOUBT * rise))
+        risk = np.where((risk > shown + HIDDEN * TOLERANCE) & (risk > SAFE * TOLERANCE), risk, -np.inf).max(axis=1)
+        # of frames with the same risk the one in the middle
+        middle = np.minimum(self.frames - self.at[before], self.at[after] - self.frames)
+        self.look_closer(risk + 1e-6 * middle, share=1.0)
+
+    def look_closer(self, risk: Float[np.ndarray, " frames"], share: float = 0.5) -> None:
         """Look at more frames from now on: those of greatest `risk`, apart from each other and from former looks."""
-        risk, taken = risk.copy(), []
+        risk, taken, most = risk.copy(), [], round(share * len(self.at))
         for frame in self.at:
             risk[max(frame - LOOKS_APART, 0) : frame + LOOKS_APART + 1] = -np.inf
-        while len(taken) < len(self.at) // 2 and risk.max() > -np.inf:
+        while len(taken) < most and risk.max() > -np.inf:
             taken.append(int(risk.argmax()))
             risk[max(taken[-1] - LOOKS_APART, 0) : taken[-1] + LOOKS_APART + 1] = -np.inf
         if taken:
