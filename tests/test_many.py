@@ -1,7 +1,9 @@
 """One clip on many bodies."""
 
+import os
 import subprocess
 import sys
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 
 import motionfit as mf
 from motionfit import samples
+from motionfit.adapt._many import _shared_folder
 
 pytestmark = pytest.mark.slow
 ARMS: dict[str, Any] = {"blocks": ("arms",)}
@@ -34,6 +37,7 @@ def test_each_starts_from_the_last_and_comes_in_order(walk, average):
 def test_bodies_are_made_when_they_are_needed(walk, average, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.setattr("motionfit._traces._folder", None)  # another test may have named one
+    _shared_folder.cache_clear()
     made: list[mf.Character] = []
 
     def bodies():
@@ -46,13 +50,17 @@ def test_bodies_are_made_when_they_are_needed(walk, average, tmp_path, monkeypat
     assert len(made) == 1
     second = next(fits)
     assert len(made) <= 5
-    assert len(list(tmp_path.glob("motionfit-*/*.trace"))) > 0  # what the workers share
     every = [first, second, *fits]
     assert len(every) == len(made) == 8
     for fit, body in zip(every, made, strict=True):
         assert np.array_equal(fit.problem.character.skin.vertices_bind, body.skin.vertices_bind)
         assert np.maximum(fit.details["excess_after_m"], 0).max() < 0.01
-    assert not list(tmp_path.glob("motionfit-*"))
+    # what the workers share stays for the next call, which traces nothing anew
+    traces = sorted(tmp_path.glob("motionfit-*/*.trace"))
+    made.clear()
+    assert len(list(islice(mf.adapt_many(walk, bodies(), reference=average, workers=2, **ARMS), 2))) == 2
+    assert sorted(tmp_path.glob("motionfit-*/*.trace")) == traces != []
+    _shared_folder.cache_clear()
 
 
 def test_a_script_needs_no_guard_and_an_error_names_itself(tmp_path):
@@ -62,13 +70,15 @@ def test_a_script_needs_no_guard_and_an_error_names_itself(tmp_path):
         "from motionfit import samples\n"
         "average = mf.load_character('builtin:average')\n"
         "try:\n"
-        "    list(mf.adapt_many(samples.walk(cycles=1), [average], reference=average, blocks=('wings',), workers=2))\n"
+        "    list(mf.adapt_many(samples.walk(cycles=1), [average] * 2, reference=average, blocks=('wings',), workers=2))\n"
         "except mf.InputError as error:\n"
         "    print(error)\n"
     )
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    place = {**os.environ, "TMPDIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, env=place)
     assert done.returncode == 0, done.stderr
     assert "wings" in done.stdout and len(done.stdout.splitlines()) == 1
+    assert not list(tmp_path.glob("motionfit-*"))
 
 
 def test_a_start_of_another_clip_is_refused(walk, average):

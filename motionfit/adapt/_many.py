@@ -1,13 +1,15 @@
 """One clip on many bodies."""
 
+import atexit
 import contextlib
+import functools
 import os
+import shutil
 import sys
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future
-from functools import partial
 from itertools import islice
 from operator import length_hint
 
@@ -47,7 +49,7 @@ def adapt_many(
     each other. `progress(done)` is called after each.
     """
     workers = min(workers or os.cpu_count() or 1, length_hint(bodies) or sys.maxsize)
-    one = partial(_adapted, clip, reference, tuple(blocks), objective)
+    one = functools.partial(_adapted, clip, reference, tuple(blocks), objective)
     if workers == 1 or jax.default_backend() != "cpu":  # one accelerator is one worker
         return _in_turn(one, bodies, progress)
     return _at_once(one, bodies, workers, progress)
@@ -86,10 +88,9 @@ def _at_once(
     waiting, last, done = iter(bodies), None, 0
     running: deque[Future[Fit]] = deque()
     with contextlib.ExitStack() as stack:
-        # what the first one compiles, the others find in a folder
-        folder = programs_folder() or stack.enter_context(tempfile.TemporaryDirectory(prefix="motionfit-"))
+        folder = str(programs_folder() or _shared_folder())  # what the first one compiles, the others find here
         settings = {name: getattr(jax.config, name) for name in SETTINGS}
-        pool = ProcessPoolExecutor(workers, initializer=_begin, initargs=(one, str(folder), settings))
+        pool = ProcessPoolExecutor(workers, initializer=_begin, initargs=(one, folder, settings))
         stack.callback(pool.shutdown, kill_workers=True)  # also where nobody wants the rest
         while True:
             # the first alone: it compiles for all
@@ -102,6 +103,14 @@ def _at_once(
             if progress is not None:
                 progress(done)
             yield last
+
+
+@functools.cache
+def _shared_folder() -> str:
+    """Where nothing is kept for the next process, workers share their programs as long as this one lives."""
+    folder = tempfile.mkdtemp(prefix="motionfit-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
 def _begin(one: One, folder: str, settings: dict) -> None:
