@@ -114,6 +114,43 @@ class Seen(NamedTuple):
     controls: tuple[Control, ...]
 
 
+class Case(NamedTuple):
+    """What stays as it is from round to round: the clip on the body, whole and as the solver sees it, its controls, the
+    clearance of all pairs on all probes, the depths [m] that do not count, and the looks at the skin (None: the volumes
+    judge alone)."""
+
+    character: Character
+    base: Motion
+    controls: tuple[Control, ...]
+    basis: Basis
+    seen: Seen
+    everything: Clearance
+    own: Float[np.ndarray, "frames pairs"]
+    looks: SkinLooks | None
+
+    @property
+    def pairs(self) -> tuple[Pair, ...]:
+        return self.everything.pairs
+
+    def final(self, correction: Correction) -> Correction:
+        """The correction of the whole clip: its controls in every frame, and the control points that they need."""
+        return Correction(self.controls, tuple(np.asarray(p)[: self.basis.count] for p in correction.points))
+
+    def moved(self, correction: Correction) -> Motion:
+        """The whole clip, corrected."""
+        return self.final(correction).apply(self.base)
+
+    def left(
+        self, depths: Float[np.ndarray, "frames pairs"], on_skin: Float[np.ndarray, "looks pairs"] | None,
+        quiet: Bool[np.ndarray, " pairs"],
+    ) -> Float[np.ndarray, "frames pairs"]:  # fmt: skip
+        """What counts [m]: the excess of all but quiet pairs, on the volumes and in the looks."""
+        excess = depths - self.own
+        if self.looks is None or on_skin is None:
+            return np.where(quiet, 0.0, excess)
+        return self.looks.joined(excess, on_skin - self.looks.own, quiet)
+
+
 def limbs(
     clip: Motion,
     character: Character,
@@ -139,73 +176,47 @@ def limbs(
     (`["held_back_m"]`). `blocks` are run in the order given, `sweeps` times, starting from zero or from the
     result of an earlier `start` for the same clip. The reference plays the `source`, where the clip is adapted already.
     """
-    base = onto(clip, character.skeleton)
-    controls, whole, seen = _controls(character, base, blocks)
-    everything = build_clearance(character, pairs_of(*blocks), objective)
-    pairs, small = everything.pairs, seen.motion
-
     known = source is not None
-    source = (clip if source is None else source)[seen.frames]
-    own = reference_depths(source, character, reference, pairs, objective)
+    case = _case(clip, character, reference, blocks, objective, clip if source is None else source)
+    base, seen, everything, own, looks = case.base, case.seen, case.everything, case.own, case.looks
+    small = seen.motion
+    first = onto(source[seen.frames], character.skeleton) if source is not None else None
     probes = at_first = probe_depths(everything, small)
     before = volume_depths(everything, small, at_first)
-    excess = before - own
-    looks = None
-    if reference is not None and objective == "vertex":
-        looks = SkinLooks(source, character, reference, pairs)
-        # the frames that were looked at when an adapted clip was made
-        first = volume_depths(everything, onto(source, character.skeleton)) - own if known else excess
-        looks.look_closer(first.max(axis=1))
-    quiet, kept = _quiet(excess, own, pairs, None if looks is None else looks.quiet(looks.depths(small)))
-    if start is not None:
-        _check_start(start, seen, pairs)
+    if looks is not None:  # first in the frames that were looked at when an adapted clip was made
+        shown = before if first is None else volume_depths(everything, first)
+        looks.look_closer((shown - own).max(axis=1))
+    quiet, kept = _quiet(before - own, own, case.pairs, None if looks is None else looks.quiet(looks.depths(small)))
+    settled = known and bool(quiet.all())  # and what is settled was looked at closely then
+    correction = _beginning(case, start)
     allowed = np.where(quiet, np.maximum(before, own), kept)
     held_back = np.zeros_like(own) if start is None else np.where(quiet, 0.0, start.details["held_back_m"])
 
-    stages = _stages(character, blocks, pairs, objective, allowed - held_back, quiet, looks is not None)
-    smooth, history = jerk_scale(base), []
-    # by name: later blocks may have added controls of their own
-    points = (Correction.zero(seen.controls).points if start is None
-              else [start.correction[c.name] for c in seen.controls])  # fmt: skip
-    # a whole clip has no more control points than the bucket that the solver sees
-    correction = Correction(seen.controls, tuple(_filled(p, seen.basis.count) for p in points))
-    if start is not None and looks is not None:
-        looks.depths_and_touches(_final(controls, whole, correction).apply(base)[seen.frames])
-    best, since, easing = Iterate(np.inf, correction, None, before, held_back, np.inf), 0, False
-    steps = sweeps * len(stages)
+    stages = _stages(character, blocks, case.pairs, objective, allowed - held_back, quiet, looks is not None)
+    smooth, history, since, easing, on_skin = jerk_scale(base), [], 0, False, None
+    best = Iterate(np.inf, correction, None, before, held_back, np.inf)
 
-    def told(round_: int):
-        if progress is None:
-            return None
-        return lambda name, done, _: progress(name, round_ * steps + done, ROUNDS * steps)  # pyright: ignore[reportOptionalCall]
-
-    settled = known and bool(quiet.all())  # and what is settled was looked at closely then
     for round_ in range(ROUNDS):
-        problem = _problem(character, seen, stages, smooth, everything, (at_first, probes), looks)
-        together = _side_by_side(stages) if seen.padded.frame_count < LONG else [s.block for s in stages]
-        result = fit(problem, together, sweeps, correction=correction, progress=told(round_))
+        problem = _problem(case, stages, smooth, (at_first, probes))
+        result = fit(problem, _together(stages, seen), sweeps, correction=correction,
+                     progress=_told(progress, round_, sweeps * len(stages)))  # fmt: skip
         if not round_ and start is None:
             result = _from_elsewhere(problem, result, stages)
         correction, history = result.correction, [*history, *result.history]
         moved = result.motion[np.arange(small.frame_count)]
-        used = np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
         probes = probe_depths(everything, moved)
         signed = signed_depths(everything, moved, probes)
-        after = np.maximum(signed, 0.0)
-        if looks is None:
-            left = np.where(quiet, 0.0, after - own)
-        else:
-            if round_ == CLOSER[0] and not settled:
-                looks.look_closer((after - own).max(axis=1))
-            if round_ == CLOSER[1] and not settled:
-                looks.look_between(looks.depths(moved), signed - own)
+        after, used = np.maximum(signed, 0.0), np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
+        if looks is not None:
+            if not settled:
+                _look_at_more(looks, round_, moved, signed - own)
             on_skin = looks.depths_and_touches(moved)
             # what the first looks missed
             woken = quiet & ~looks.quiet(on_skin)
             quiet = quiet & ~woken
             stages = [_wake(s, woken[s.columns], kept[:, s.columns]) for s in stages]
-            left = looks.joined(after - own, on_skin - looks.own, quiet)
-        jerk = derivative_ratio(_final(controls, whole, correction).apply(base), base, 3) or 1.0
+        left = case.left(after, on_skin, quiet)
+        jerk = derivative_ratio(case.moved(correction), base, 3) or 1.0
         faults = max(jerk - MOST_JERK, 0.0) / 0.2 + _amount(left) / TOLERANCE
         # one that was looked at in fewer frames cannot be compared
         found = Iterate(faults, correction, result.problem, after, allowed - used, left.max(initial=0.0))
@@ -214,7 +225,7 @@ def limbs(
         since += 1
         easing |= found.clean and (settled or round_ >= CLOSER[-1])
         if easing:
-            if looks is None or not looks.ease(on_skin, ALLOWED_EXCESS):
+            if looks is None or on_skin is None or not looks.ease(on_skin, ALLOWED_EXCESS):
                 break
             continue
         if since > PATIENCE:
@@ -227,19 +238,63 @@ def limbs(
             more = np.where(left > ENOUGH * TOLERANCE, after - used, 0.0)
             stages = [_tighten(s, more[:, s.columns], float(small.dt)) for s in stages]
     if looks is not None and (best.left > TOLERANCE or known):
-        first = onto(source, character.skeleton) if known else None
-        worth = _worth_it(best.correction, looks, stages, base, first, seen, controls, whole)
-        best = best._replace(correction=worth)
-        moved = _final(controls, whole, best.correction).apply(base)[seen.frames]
-        after = volume_depths(everything, moved)
-        best = best._replace(
-            depths=after, left=looks.joined(after - own, looks.depths(moved) - looks.own, quiet).max(initial=0.0)
-        )
-    final = _final(controls, whole, best.correction)
+        worth = _worth_it(case, best.correction, stages, first)
+        shown = case.moved(worth)[seen.frames]
+        depths = volume_depths(everything, shown)
+        left = case.left(depths, looks.depths(shown), quiet)
+        best = best._replace(correction=worth, depths=depths, left=left.max(initial=0.0))
+    final = case.final(best.correction)
     status = "violations_left" if best.left > TOLERANCE else "converged"
-    details = {"pairs": [p.name for p in pairs], "frames": seen.frames, "excess_before_m": excess,
+    details = {"pairs": [p.name for p in case.pairs], "frames": seen.frames, "excess_before_m": before - own,
                "excess_after_m": best.depths - own, "held_back_m": best.held_back}  # fmt: skip
     return Fit(final, final.apply(base), base, status, tuple(history), best.problem, details)  # pyright: ignore[reportArgumentType]
+
+
+def _case(
+    clip: Motion, character: Character, reference: Character | None, blocks: Sequence[str], objective: str,
+    source: Motion,
+) -> Case:  # fmt: skip
+    base = onto(clip, character.skeleton)
+    controls, basis, seen = _controls(character, base, blocks)
+    everything = build_clearance(character, pairs_of(*blocks), objective)
+    source = source[seen.frames]
+    own = reference_depths(source, character, reference, everything.pairs, objective)
+    looks = None
+    if reference is not None and objective == "vertex":
+        looks = SkinLooks(source, character, reference, everything.pairs)
+    return Case(character, base, controls, basis, seen, everything, own, looks)
+
+
+def _beginning(case: Case, start: Fit | None) -> Correction:
+    """Control points of the solver's frames to begin with: zero, or those of an earlier result."""
+    seen = case.seen
+    # a whole clip has no more control points than the bucket that the solver sees
+    empty = Correction(seen.controls, tuple(np.zeros(seen.basis.count) for _ in seen.controls))
+    if start is None:
+        return empty
+    _check_start(start, seen, case.pairs)
+    # by name: later blocks may have added controls of their own
+    points = (np.asarray(start.correction[c.name], float) for c in seen.controls)
+    result = Correction(seen.controls, tuple(np.pad(p, (0, seen.basis.count - len(p))) for p in points))
+    if case.looks is not None:
+        case.looks.depths_and_touches(case.moved(result)[seen.frames])
+    return result
+
+
+def _look_at_more(looks: SkinLooks, round_: int, moved: Motion, signed: Float[np.ndarray, "frames pairs"]) -> None:
+    """More frames to look at after the first rounds: those of most excess on the fields, then those between two looks
+    that may hide some."""
+    if round_ == CLOSER[0]:
+        looks.look_closer(np.maximum(signed, 0.0).max(axis=1))
+    if round_ == CLOSER[1]:
+        looks.look_between(looks.depths(moved), signed)
+
+
+def _told(progress: Callable[[str, int, int], None] | None, round_: int, steps: int):
+    """The progress of one round of so many steps."""
+    if progress is None:
+        return None
+    return lambda name, done, _: progress(name, round_ * steps + done, ROUNDS * steps)
 
 
 def _quiet(
@@ -282,15 +337,13 @@ def _from_elsewhere(problem: Problem, result: Fit, stages: list[Stage]) -> Fit:
     return result
 
 
-def _worth_it(
-    correction: Correction, looks: SkinLooks, stages: list[Stage], base: Motion, first: Motion | None, seen: Seen,
-    controls: tuple[Control, ...], whole: Basis,
-) -> Correction:  # fmt: skip
+def _worth_it(case: Case, correction: Correction, stages: list[Stage], first: Motion | None) -> Correction:
     """A correction without the blocks that leave their pairs deeper in each other, on the skin, than they were: where
     the fields see what is not there, the clip is better left alone. Of a clip that was adapted from `first` also
     without those that had done their work: what is still there then is what they could not take out."""
-    moved = _final(controls, whole, correction).apply(base)
-    now, was = (looks.depths(m[seen.frames]) - looks.own for m in (moved, base))
+    looks = case.looks
+    assert looks is not None
+    now, was = (looks.depths(m[case.seen.frames]) - looks.own for m in (case.moved(correction), case.base))
     once = was if first is None else looks.depths(first) - looks.own
     names = set()
     for stage in stages:
@@ -319,15 +372,13 @@ def _check_start(start: Fit, seen: Seen, pairs: tuple[Pair, ...]) -> None:
                          "and blocks, or leave it out")  # fmt: skip
 
 
-def _filled(points, count: int) -> Float[np.ndarray, " count"]:
-    return np.concatenate([np.asarray(points, float), np.zeros(count - len(points))])
-
-
-def _side_by_side(stages: list[Stage]) -> Sequence[Block | tuple[Block, ...]]:
+def _together(stages: list[Stage], seen: Seen) -> Sequence[Block | tuple[Block, ...]]:
     """The legs do not look at the arms, so they go with the first one. The other arm shares its program, and waits."""
     blocks = [s.block for s in stages]
     legs = tuple(b for b in blocks if b.name == "legs")
-    return blocks if len(blocks) == 1 or not legs else [(blocks[0], *legs), *(b for b in blocks[1:] if b not in legs)]
+    if len(blocks) == 1 or not legs or seen.padded.frame_count >= LONG:
+        return blocks
+    return [(blocks[0], *legs), *(b for b in blocks[1:] if b not in legs)]
 
 
 def _amount(over: Float[np.ndarray, "frames pairs"]) -> float:
@@ -352,11 +403,6 @@ def _controls(character: Character, base: Motion, blocks: Sequence[str]) -> tupl
 
     padded = dataclasses.replace(base[at.rows], dt=np.asarray(at.dt))
     return controls, whole, Seen(at.frames, at.motion(base), padded, at.basis, tuple(at.control(c) for c in controls))
-
-
-def _final(controls: Sequence[Control], basis: Basis, correction: Correction) -> Correction:
-    """The correction of the whole clip: its controls in every frame, and the control points that they need."""
-    return Correction(tuple(controls), tuple(np.asarray(p)[: basis.count] for p in correction.points))
 
 
 def _stages(
@@ -390,10 +436,10 @@ def _own_sets(everything: Clearance, stage: Stage) -> Bool[np.ndarray, " sets"]:
 
 
 def _problem(
-    character: Character, seen: Seen, stages: list[Stage], smooth: float,
-    everything: Clearance, probes: tuple[Float[np.ndarray, "frames sets points"] | None, ...], looks: SkinLooks | None,
-) -> Problem:  # fmt: skip
+    case: Case, stages: list[Stage], smooth: float, probes: tuple[Float[np.ndarray, "frames sets points"] | None, ...]
+) -> Problem:
     """The terms of all stages; `probes` are the depths of all, by which those that matter are chosen."""
+    seen, everything, looks = case.seen, case.everything, case.looks
     real, length = seen.motion.frame_count, seen.padded.frame_count
     terms: dict[str, Term] = {}
     scores = np.zeros((0, 0))
@@ -420,7 +466,7 @@ def _problem(
     terms["smoothness"] = During(Smoothness(smooth), (frames < real - 2).astype(float))
     steady = Steadiness(np.array([SIGMA_PACE.get(c.name, np.inf) for c in seen.controls]))
     terms["steadiness"] = During(steady, (frames < real - 1).astype(float))
-    return Problem(character, seen.padded, terms, seen.controls)
+    return Problem(case.character, seen.padded, terms, seen.controls)
 
 
 def jerk_scale(base: Motion) -> float:
