@@ -187,13 +187,13 @@ def limbs(
         shown = before if first is None else volume_depths(everything, first)
         looks.look_closer((shown - own).max(axis=1))
     quiet, kept = _quiet(before - own, own, case.pairs, None if looks is None else looks.quiet(looks.depths(small)))
-    settled = known and bool(quiet.all())  # and what is settled was looked at closely then
+    settled = checked = known and bool(quiet.all())  # and what is settled was looked at closely then
     correction = _beginning(case, start)
     allowed = np.where(quiet, np.maximum(before, own), kept)
     held_back = np.zeros_like(own) if start is None else np.where(quiet, 0.0, start.details["held_back_m"])
 
     stages = _stages(character, blocks, case.pairs, objective, allowed - held_back, quiet, looks is not None)
-    smooth, history, since, easing, on_skin = jerk_scale(base), [], 0, False, None
+    smooth, history, since, easing, on_skin, missed = jerk_scale(base), [], 0, False, None, False
     best = Iterate(np.inf, correction, None, before, held_back, np.inf)
 
     for round_ in range(ROUNDS):
@@ -208,9 +208,13 @@ def limbs(
         signed = signed_depths(everything, moved, probes)
         after, used = np.maximum(signed, 0.0), np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
         if looks is not None:
-            if not settled:
-                _look_at_more(looks, round_, moved, signed - own)
-            on_skin = looks.depths_and_touches(moved)
+            if round_ in CLOSER and not settled:
+                looks.look_closer((after - own).max(axis=1))
+            on_skin, missed = looks.depths_and_touches(moved), False
+            if round_ >= CLOSER[-1] and not checked and (on_skin <= looks.own + TOLERANCE).all():
+                # clean where it was looked at: in between it is looked at once
+                missed = looks.look_between(moved)
+                on_skin, checked = looks.depths_and_touches(moved), not missed
             # what the first looks missed
             woken = quiet & ~looks.quiet(on_skin)
             quiet = quiet & ~woken
@@ -218,9 +222,9 @@ def limbs(
         left = case.left(after, on_skin, quiet)
         jerk = derivative_ratio(case.moved(correction), base, 3) or 1.0
         faults = max(jerk - MOST_JERK, 0.0) / 0.2 + _amount(left) / TOLERANCE
-        # one that was looked at in fewer frames cannot be compared
         found = Iterate(faults, correction, result.problem, after, allowed - used, left.max(initial=0.0))
-        if found.better_than(best) or round_ in CLOSER:
+        # one that was looked at in fewer frames cannot be compared
+        if found.better_than(best) or missed or round_ in CLOSER:
             best, since = found, 0
         since += 1
         easing |= found.clean and (settled or round_ >= CLOSER[-1])
@@ -235,8 +239,8 @@ def limbs(
             correction = _calmed(correction)
         if left.max() > ENOUGH * TOLERANCE:
             # the solver sees some probes only, and its corrections are smooth: what they left is taken off
-            more = np.where(left > ENOUGH * TOLERANCE, after - used, 0.0)
-            stages = [_tighten(s, more[:, s.columns], float(small.dt)) for s in stages]
+            over = np.where(left > ENOUGH * TOLERANCE, after - used, 0.0)
+            stages = [_tighten(s, over[:, s.columns], float(small.dt)) for s in stages]
     if looks is not None and (best.left > TOLERANCE or known):
         worth = _worth_it(case, best.correction, stages, first)
         shown = case.moved(worth)[seen.frames]
@@ -279,15 +283,6 @@ def _beginning(case: Case, start: Fit | None) -> Correction:
     if case.looks is not None:
         case.looks.depths_and_touches(case.moved(result)[seen.frames])
     return result
-
-
-def _look_at_more(looks: SkinLooks, round_: int, moved: Motion, signed: Float[np.ndarray, "frames pairs"]) -> None:
-    """More frames to look at after the first rounds: those of most excess on the fields, then those between two looks
-    that may hide some."""
-    if round_ == CLOSER[0]:
-        looks.look_closer(np.maximum(signed, 0.0).max(axis=1))
-    if round_ == CLOSER[1]:
-        looks.look_between(looks.depths(moved), signed)
 
 
 def _told(progress: Callable[[str, int, int], None] | None, round_: int, steps: int):

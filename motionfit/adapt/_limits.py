@@ -18,12 +18,8 @@ from motionfit.terms.penetration import TouchClearance
 
 LEAST_LOOKS, LOOK_SHARE = 16, 1 / 15  # looks at the skin: at least, and per frame that the solver sees
 NEARLY = 0.9  # of TOLERANCE: what a result may show, since between two looks there may be a little more
-LOOKS_APART = 1  # frames between two looks, at least
-OPENED = 0.5  # of a fold's depth: what is left of it at most
-BLIND = 0.015  # [m] of skin inside a part that its field may not show, where hips or shoulders are bent far
-DOUBT = 3.0  # of what a field shows more between two looks: how far it may be wrong there, up to BLIND
-HIDDEN = 0.25  # of TOLERANCE: what may be there besides what the looks have shown
-SAFE = 0.8  # of TOLERANCE: what may be between two looks without a third one there
+LOOKS_APART = 2  # [frames] that two looks are at least apart
+EVERY = 2  # of the solver's frames, the one in which a result is looked at once
 ENOUGH = 0.7  # of TOLERANCE: what a look may still show
 FARTHER = 0.005  # [m] out than need be, from which on touches are eased
 EASES = (0.5, 0.25, 0.0)  # of what was found, one after the other
@@ -84,11 +80,11 @@ class SkinLooks:
 
     def depths(self, motion: Motion) -> Float[np.ndarray, "looks pairs"]:
         """Depth [m] per look and pair of a motion of the solver's frames."""
-        return np.array([look.depths for look in self._look(motion).values()])
+        return np.array([look.depths for look in self._look(motion, self.at).values()])
 
     def depths_and_touches(self, motion: Motion) -> Float[np.ndarray, "looks pairs"]:
         """The same, and what goes beyond the reference is kept: `touches`, by frame, the latest ones first."""
-        looked = self._look(motion)
+        looked = self._look(motion, self.at)
         for (frame, pose), look in looked.items():
             if self.found_in.get(frame) != pose:
                 self.touches[frame] = look.touches.then(self.touches[frame]) if frame in self.touches else look.touches
@@ -98,10 +94,10 @@ class SkinLooks:
             self.deepest = np.maximum(self.deepest, result - self.own)
         return result
 
-    def _look(self, motion: Motion) -> dict[tuple[int, bytes], Look]:
+    def _look(self, motion: Motion, at: Int[np.ndarray, " some"]) -> dict[tuple[int, bytes], Look]:
         """What each look shows; poses that were seen before are not looked at again."""
-        looked = motion[self.at]
-        keys = list(zip(self.at.tolist(), _poses(looked), strict=True))
+        looked, own = motion[at], self._own(at)
+        keys = list(zip(at.tolist(), _poses(looked), strict=True))
         new = np.array([i for i, key in enumerate(keys) if key not in self.seen], int)
         if len(new):
             looked = looked[new]
@@ -110,7 +106,7 @@ class SkinLooks:
                 depths = np.zeros(len(self.pairs))
                 for (pair, *_), inside in found.items():
                     depths[pair] = max(depths[pair], inside.depth.max(initial=0.0))
-                touches = touches_of(self.character, rotations[k], vertices, found, self.own[new[k]])
+                touches = touches_of(self.character, rotations[k], vertices, found, own[new[k]])
                 self.seen[keys[new[k]]] = Look(depths, touches)
         return {key: self.seen[key] for key in keys}
 
@@ -137,41 +133,41 @@ class SkinLooks:
         self.eased = np.where(sinks, less, self.eased)
         return wanted
 
-    def look_between(self, seen: Float[np.ndarray, "looks pairs"], signed: Float[np.ndarray, "frames pairs"]) -> None:
-        """Look at more frames from now on: those that may show more than the looks on both sides of them have `seen`.
-
-        Where a fold opens on the reference from the one look to the other, it may open on this body later, or earlier:
-        as much as one look showed may be there, and as little allowed as in the other. Else the fields tell what there
-        is besides, by their `signed` excess [m], negative where there is a gap. Of parts that were apart in both looks
-        it tells how near they came; where it does not rise, the looks have shown it right.
-        """
-        after = np.minimum(np.maximum(np.searchsorted(self.at, self.frames, side="right"), 1), len(self.at) - 1)
-        before = np.maximum(after - 1, 0)
-
-        def on_both_sides(x):
-            return np.minimum(x[before], x[after]), np.maximum(x[before], x[after])
-
-        (_, most), (least, own), (_, shown) = map(on_both_sides, (seen, self.own, np.maximum(seen - self.own, 0.0)))
-        rise = np.maximum(signed - on_both_sides(signed[self.at])[1], 0.0)
-        risk = np.where(least < OPENED * own, most - least, shown) + rise
-        risk = np.where(most > 0.0, risk, signed + np.minimum(BLIND, DOUBT * rise))
-        risk = np.where((risk > shown + HIDDEN * TOLERANCE) & (risk > SAFE * TOLERANCE), risk, -np.inf).max(axis=1)
-        # of frames with the same risk the one in the middle
-        middle = np.minimum(self.frames - self.at[before], self.at[after] - self.frames)
-        self.look_closer(risk + 1e-6 * middle, share=1.0)
-
-    def look_closer(self, risk: Float[np.ndarray, " frames"], share: float = 0.5) -> None:
+    def look_closer(self, risk: Float[np.ndarray, " frames"]) -> None:
         """Look at more frames from now on: those of greatest `risk`, apart from each other and from former looks."""
-        risk, taken, most = risk.copy(), [], round(share * len(self.at))
+        risk, taken = risk.copy(), []
         for frame in self.at:
             risk[max(frame - LOOKS_APART, 0) : frame + LOOKS_APART + 1] = -np.inf
-        while len(taken) < most and risk.max() > -np.inf:
+        while len(taken) < len(self.at) // 2 and risk.max() > -np.inf:
             taken.append(int(risk.argmax()))
             risk[max(taken[-1] - LOOKS_APART, 0) : taken[-1] + LOOKS_APART + 1] = -np.inf
-        if taken:
-            order = np.argsort(at := np.concatenate([self.at, taken]))
-            self.own = np.concatenate([self.own, self._own(np.array(taken))])[order]
-            none = np.zeros((len(taken), len(self.pairs)))
+        self._look_at(taken)
+
+    def look_between(self, motion: Motion) -> bool:
+        """Look at a motion in every second frame once, and from now on in those that show nearly the tolerance. Says
+        whether there are any. What is there in a single frame is let be: where the fold of an armpit opens a frame
+        later than the reference's, an arm would have to be led out and back for it."""
+        others = np.setdiff1d(self.frames[::EVERY], self.at)
+        over = others[self._shows(motion, others)]
+        beside = np.intersect1d([over - 1, over + 1], self.frames)
+        beside = np.setdiff1d(beside, np.concatenate([self.at, over]))
+        over = np.union1d(over, beside[self._shows(motion, beside)])
+        lasting = np.isin(over - 1, over) | np.isin(over + 1, over)
+        self._look_at(over[lasting].tolist())
+        return bool(lasting.any())
+
+    def _shows(self, motion: Motion, at: Int[np.ndarray, " some"]) -> Bool[np.ndarray, " some"]:
+        """Whether a frame shows nearly the tolerance."""
+        if len(at) == 0:
+            return np.zeros(0, bool)
+        shown = np.array([look.depths for look in self._look(motion, at).values()]).reshape(len(at), -1)
+        return (shown - self._own(at) > NEARLY * TOLERANCE).any(axis=1)  # pyright: ignore[reportReturnType]
+
+    def _look_at(self, frames: list[int]) -> None:
+        if frames:
+            order = np.argsort(at := np.concatenate([self.at, frames]))
+            self.own = np.concatenate([self.own, self._own(np.array(frames))])[order]
+            none = np.zeros((len(frames), len(self.pairs)))
             self.deepest, self.eased = (np.concatenate([x, none])[order] for x in (self.deepest, self.eased))
             self.at = at[order]
 
