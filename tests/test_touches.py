@@ -110,36 +110,32 @@ def test_touches_give_way_where_the_skin_is_out_too_far():
     assert not looks.ease(out, 0.002)
 
 
-@pytest.mark.parametrize("over, asked, taken", [
-    ([], [2, 6, 10], []),
-    ([6, 7], [2, 6, 10, 5, 7], [6, 7]),
-    ([9, 10, 11], [2, 6, 10, 9, 11], [9, 10, 11]),
-    ([6], [2, 6, 10, 5, 7], []),  # an arm would have to be led out and back for it
-    ([1, 2, 6], [2, 6, 10, 1, 3, 5, 7], [1, 2]),
-    ([3], [2, 6, 10], []),  # between two frames that show nothing
+@pytest.mark.parametrize("shown, beside, taken", [
+    ({}, [], []),
+    ({6: 0.95, 7: 0.92}, [5, 7], [6, 7]),
+    ({9: 0.75, 10: 0.95, 11: 0.65}, [9, 11], [9, 10]),  # a hump, of which the solver is to see the flank
+    ({6: 3.0}, [5, 7], []),  # an arm would have to be led out and back for it
+    ({0: 0.75, 1: 2.0, 2: 0.95, 6: 0.95}, [1, 3, 5, 7], [1, 2]),
+    ({4: 0.95, 5: 1.1}, [3, 5], [5]),  # beside a look
+    ({4: 0.95, 5: 0.8}, [3, 5], []),  # which shows the most of it
+    ({3: 3.0}, [], []),  # between two frames that show nothing
 ])  # fmt: skip
-def test_what_is_clean_is_looked_at_in_between(over, asked, taken):
+def test_what_is_clean_is_looked_at_in_between(shown, beside, taken):
     looks = object.__new__(SkinLooks)  # what it decides by, without a body
     looks.at, looks.frames, looks.pairs = np.array([0, 4, 8, 12]), np.arange(13), PAIRS[:1]
     looks.own, looks.deepest, looks.eased = (np.zeros((4, 1)) for _ in range(3))
     looks._own = lambda at: np.full((len(at), 1), 0.02)
-    seen = []
+    seen = set()
 
     def look(motion, at):
-        seen.extend(at.tolist())
-        return {t: Look(np.array([0.02 + (0.0091 if t in over else 0.0089)]), NONE) for t in at.tolist()}
+        seen.update(at.tolist())
+        return {t: Look(np.array([0.02 + shown.get(t, 0.0) / 100]), NONE) for t in at.tolist()}
 
     looks._look = look
     assert looks.look_between(rest_motion(samples.walk().skeleton)) == bool(taken)
-    assert sorted(seen) == sorted(asked)
+    assert seen == {*range(0, 13, 2), *beside}
     assert looks.at.tolist() == sorted([0, 4, 8, 12, *taken])
     assert len(looks.own) == len(looks.deepest) == len(looks.eased) == len(looks.at)
-
-
-def test_a_clip_of_one_frame_has_no_between():
-    looks = object.__new__(SkinLooks)
-    looks.at, looks.frames = np.array([0]), np.arange(1)
-    assert not looks.look_between(rest_motion(samples.walk().skeleton))
 
 
 def test_no_pose_is_looked_at_twice(heavy, average, clip, monkeypatch):

@@ -144,24 +144,27 @@ class SkinLooks:
         self._look_at(taken)
 
     def look_between(self, motion: Motion) -> bool:
-        """Look at a motion in every second frame once, and from now on in those that show nearly the tolerance. Says
-        whether there are any. What is there in a single frame is let be: where the fold of an armpit opens a frame
-        later than the reference's, an arm would have to be led out and back for it."""
-        others = np.setdiff1d(self.frames[::EVERY], self.at)
-        over = others[self._shows(motion, others)]
-        beside = np.intersect1d([over - 1, over + 1], self.frames)
-        beside = np.setdiff1d(beside, np.concatenate([self.at, over]))
-        over = np.union1d(over, beside[self._shows(motion, beside)])
-        lasting = np.isin(over - 1, over) | np.isin(over + 1, over)
-        self._look_at(over[lasting].tolist())
-        return bool(lasting.any())
+        """Look at a motion in every second frame once, and from now on where some show nearly the tolerance. Says
+        whether there are any.
 
-    def _shows(self, motion: Motion, at: Int[np.ndarray, " some"]) -> Bool[np.ndarray, " some"]:
-        """Whether a frame shows nearly the tolerance."""
-        if len(at) == 0:
-            return np.zeros(0, bool)
-        shown = np.array([look.depths for look in self._look(motion, at).values()]).reshape(len(at), -1)
-        return (shown - self._own(at) > NEARLY * TOLERANCE).any(axis=1)  # pyright: ignore[reportReturnType]
+        What is there in a single frame is let be: where the fold of an armpit opens a frame later than the reference's,
+        an arm would have to be led out and back for it.
+        """
+        at = np.union1d(self.frames[::EVERY], self.at)
+        over = at[self._excess(motion, at) > NEARLY * TOLERANCE]
+        beside = np.intersect1d([over - 1, over + 1], self.frames)
+        over = np.union1d(over, beside[self._excess(motion, beside) > ENOUGH * TOLERANCE])
+        lasting = over[np.isin(over - 1, over) | np.isin(over + 1, over)]
+        missed = np.setdiff1d(lasting, self.at)
+        if (self._excess(motion, missed) <= NEARLY * TOLERANCE).all():
+            return False
+        self._look_at(missed.tolist())
+        return True
+
+    def _excess(self, motion: Motion, at: Int[np.ndarray, " some"]) -> Float[np.ndarray, " some"]:
+        """The greatest excess [m] of any pair in some frames."""
+        shown = [look.depths for look in self._look(motion, at).values()] if len(at) else []
+        return np.array([(d - own).max() for d, own in zip(shown, self._own(at), strict=True)] if shown else [])
 
     def _look_at(self, frames: list[int]) -> None:
         if frames:
