@@ -207,16 +207,10 @@ def volume_depths(
 ) -> Float[np.ndarray, "frames pairs"]:
     """Depth [m] of every pair in every frame on the volumes, 0 where they are apart. `probes` are the motion's
     `probe_depths`, where they are at hand."""
-    return np.maximum(signed_depths(clearance, motion, probes), 0.0)
-
-
-def signed_depths(
-    clearance: Clearance, motion: Motion, probes: Float[np.ndarray, "frames sets points"] | None = None
-) -> Float[np.ndarray, "frames pairs"]:
-    """The same, negative where they are apart."""
     rows = all_rows(clearance.term, motion) if probes is None else probes.max(axis=2).astype(float)
     owner = np.array(clearance.pair_of_row)
-    return np.stack([rows[:, owner == k].max(axis=1) for k in range(len(clearance.pairs))], axis=1)
+    depth = np.stack([rows[:, owner == k].max(axis=1) for k in range(len(clearance.pairs))], axis=1)
+    return np.maximum(depth, 0.0)
 
 
 def support(

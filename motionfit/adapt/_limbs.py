@@ -22,7 +22,6 @@ from motionfit.adapt._clearance import (
     build_clearance,
     probe_depths,
     reduced,
-    signed_depths,
     support,
     volume_depths,
 )
@@ -205,8 +204,8 @@ def limbs(
         correction, history = result.correction, [*history, *result.history]
         moved = result.motion[np.arange(small.frame_count)]
         probes = probe_depths(everything, moved)
-        signed = signed_depths(everything, moved, probes)
-        after, used = np.maximum(signed, 0.0), np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
+        after = volume_depths(everything, moved, probes)
+        used = np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
         if looks is not None:
             if round_ in CLOSER and not settled:
                 looks.look_closer((after - own).max(axis=1))
