@@ -96,17 +96,17 @@ class SkinLooks:
 
     def _look(self, motion: Motion, at: Int[np.ndarray, " some"]) -> dict[tuple[int, bytes], Look]:
         """What each look shows; poses that were seen before are not looked at again."""
-        looked, own = motion[at], self._own(at)
+        looked = motion[at]
         keys = list(zip(at.tolist(), _poses(looked), strict=True))
         new = np.array([i for i, key in enumerate(keys) if key not in self.seen], int)
         if len(new):
-            looked = looked[new]
+            looked, own = looked[new], self._own(at[new])
             rotations = host_kinematics(looked)[1]
             for k, vertices, found in insides(self.character, looked, self.pairs):
                 depths = np.zeros(len(self.pairs))
                 for (pair, *_), inside in found.items():
                     depths[pair] = max(depths[pair], inside.depth.max(initial=0.0))
-                touches = touches_of(self.character, rotations[k], vertices, found, own[new[k]])
+                touches = touches_of(self.character, rotations[k], vertices, found, own[k])
                 self.seen[keys[new[k]]] = Look(depths, touches)
         return {key: self.seen[key] for key in keys}
 
