@@ -37,8 +37,8 @@ from scipy.spatial.transform import Rotation
 import motionfit as mf
 from benchmarks.metrics import Metric, has_banded, seconds
 from motionfit import samples
-from motionfit._fit import levenberg_marquardt
 from motionfit._problem import term_cost
+from motionfit._solve import levenberg_marquardt
 from motionfit.adapt import build_clearance, volume_depths
 from motionfit.shape.pairs import pairs_of
 from motionfit.splines import bspline_basis

@@ -20,7 +20,6 @@ from ._control import Control as Control
 from ._control import Correction as Correction
 from ._control import Drive as Drive
 from ._control import load_correction as load_correction
-from ._fit import Block as Block
 from ._fit import Fit as Fit
 from ._fit import fit as fit
 from ._motion import Kinematics as Kinematics
@@ -37,6 +36,7 @@ from ._problem import Term as Term
 from ._skeleton import Skeleton as Skeleton
 from ._skinning import Skin as Skin
 from ._skinning import skin as skin
+from ._solve import Block as Block
 from ._traces import keep_programs as keep_programs
 from ._types import InputError as InputError
 from .adapt._many import adapt_many as adapt_many

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from motionfit import rotation
+from motionfit._files import whole
 from motionfit._motion import Motion
 from motionfit._types import AnyArray, InputError
 from motionfit.splines import Basis
@@ -129,15 +130,8 @@ class Correction(eqx.Module):
             for i, drive in enumerate(control.drives):
                 arrays |= {f"{k}.{i}.axis": drive.axis_parent, f"{k}.{i}.gain": drive.gain}
         arrays["motionfit_correction"] = np.array(json.dumps(described))
-        path = pathlib.Path(path)
-        partial = path.with_name(path.name + ".part")
-        try:
-            with open(partial, "wb") as file:
-                np.savez(file, **{k: np.asarray(v) for k, v in arrays.items()})  # pyright: ignore[reportArgumentType]: NumPy's stub
-            partial.replace(path)
-        except OSError as error:
-            partial.unlink(missing_ok=True)
-            raise InputError(f"{path}: cannot write the correction ({error.strerror})") from None
+        with whole(path) as partial, open(partial, "wb") as file:
+            np.savez(file, **{k: np.asarray(v) for k, v in arrays.items()})  # pyright: ignore[reportArgumentType]: NumPy's stub
 
 
 def load_correction(path: str | pathlib.Path) -> Correction:

@@ -330,9 +330,10 @@ def _finite(value):
 
 
 def _write_json(path: pathlib.Path, data: dict) -> None:
-    from motionfit.io.bvh import write_text
+    from motionfit._files import whole
 
-    write_text(path, json.dumps(_finite(data), indent=2, allow_nan=False) + "\n")
+    with whole(path) as partial:
+        partial.write_text(json.dumps(_finite(data), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _print_table(columns: dict[str, dict]) -> None:

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 import motionfit as mf
 import motionfit.banded
-from motionfit._fit import banded_solver, block_adjoint, block_work, levenberg_marquardt, solve_block
 from motionfit._motion import rest_motion
+from motionfit._solve import banded_solver, block_adjoint, block_work, levenberg_marquardt, solve_block
 from motionfit.banded import Banded
 from motionfit.splines import bspline_basis
 from tests.helpers import central_difference

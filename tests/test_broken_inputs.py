@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import motionfit as mf
-from motionfit import samples
+from motionfit import samples, view
 from motionfit.cli import main
 
 BVH = """HIERARCHY
@@ -200,3 +200,28 @@ def test_truncated_glb(monkeypatch, capsys, tmp_path):
 def test_a_skeleton_without_the_roles_is_told_what_was_found(monkeypatch, capsys, tmp_path):
     (tmp_path / "clip.bvh").write_text(BVH)
     _refused(monkeypatch, capsys, tmp_path, tmp_path / "clip.bvh", "builtin:average", "found chest=Spine, hips=Hips")
+
+
+@pytest.mark.parametrize("name", ["clip.bvh", "clip.glb", "clip.npz", "correction.npz", "plants.csv", "look.png"])
+def test_what_cannot_be_written_whole_leaves_the_old_file_and_nothing_beside_it(name, monkeypatch, tmp_path):
+    clip, body = samples.walk(cycles=1), mf.load_character("builtin:average")
+    found = mf.remove_footskate(clip, body)
+    save = {
+        "correction.npz": mf.Correction((), ()).save,
+        "plants.csv": found.plants.save,
+        "look.png": lambda path: view.footprints_picture(path, found),
+    }.get(name, lambda path: mf.save(path, clip, body))
+    old = tmp_path / name
+    old.write_bytes(b"what was there before")
+
+    def full(self, target):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch, pytest.raises(mf.InputError, match=f"{name}: cannot be written .No space"):
+        patch.setattr(pathlib.Path, "replace", full)
+        save(old)
+    assert old.read_bytes() == b"what was there before"
+    assert [file.name for file in tmp_path.iterdir()] == [name]
+    save(old)
+    assert old.read_bytes() != b"what was there before"
+    assert [file.name for file in tmp_path.iterdir()] == [name]

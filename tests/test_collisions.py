@@ -14,8 +14,8 @@ from benchmarks.thesis import valley
 from motionfit import samples
 from motionfit._character import PARTS
 from motionfit._control import Correction
-from motionfit._fit import block_adjoint, block_solver, block_work, solve_block
 from motionfit._motion import Motion, host_kinematics, joint_angles, rest_motion
+from motionfit._solve import block_adjoint, block_solver, block_work, solve_block
 from motionfit.adapt import Group, Sphere, Turn, multi_start
 from motionfit.adapt._collisions import GROUPS, arm_turns, eased, known_depths, on_top, sinking_skin, skin_looks
 from motionfit.adapt._controls import turn_controls

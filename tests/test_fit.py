@@ -96,7 +96,7 @@ def test_nothing_to_do_and_zero_correction_are_bit_for_bit(still):
 
 def test_frame_local_rule_gives_the_same_jacobian(still):
     """The one product per control against plain forward mode."""
-    from motionfit._fit import _columns_of_signals, _Rows, _times_signals, _with_columns
+    from motionfit._solve import _columns_of_signals, _Rows, _times_signals, _with_columns
 
     character, motion = still
     controls = tuple(_control(character, motion, r) for r in ("left_upper_arm", "left_forearm"))
@@ -110,7 +110,7 @@ def test_frame_local_rule_gives_the_same_jacobian(still):
 
 def test_rows_that_reach_over_frames_have_the_same_tangent(still):
     """By the kinematics' columns against plain forward mode, for rows that read all that moves."""
-    from motionfit._fit import _PointRows, _Rows
+    from motionfit._solve import _PointRows, _Rows
 
     def rows(kin, shift):
         moved = shift + jnp.concatenate([x.reshape(len(x), -1) for x in (

@@ -10,8 +10,8 @@ import pytest
 
 import motionfit as mf
 from motionfit import samples
-from motionfit._fit import banded_solver, block_adjoint, block_solver, block_work, solve_block
 from motionfit._motion import joint_angles
+from motionfit._solve import banded_solver, block_adjoint, block_solver, block_work, solve_block
 from motionfit.adapt._sensitivity import Held, _answer, _slope
 from motionfit.shape import grow
 

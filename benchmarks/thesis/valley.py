@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 import motionfit as mf
 from benchmarks.thesis._setting import argument_parser, table
 from motionfit._control import Control, Correction, Drive
-from motionfit._fit import block_work
 from motionfit._motion import Motion
+from motionfit._solve import block_work
 from motionfit.adapt._forearm import costs_on_grid
 from motionfit.splines import bspline_basis
 from motionfit.terms import Direction, Effort

@@ -12,11 +12,12 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
 
 from motionfit._character import Character
 from motionfit._control import Control, Correction
-from motionfit._fit import Block, Fit, fit
+from motionfit._fit import Fit, fit
 from motionfit._motion import Motion, continued, host_kinematics
 from motionfit._onto import onto
 from motionfit._problem import During, Problem
 from motionfit._skeleton import SIDES
+from motionfit._solve import Block
 from motionfit._types import InputError
 from motionfit.adapt._clearance import build_clearance, volume_depths
 from motionfit.adapt._controls import lean_controls

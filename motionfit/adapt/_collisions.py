@@ -14,11 +14,12 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from motionfit._character import PARTS, Character
 from motionfit._control import Correction
-from motionfit._fit import Block, Fit, fit
+from motionfit._fit import Fit, fit
 from motionfit._motion import Motion, bind_pose, joint_angles
 from motionfit._onto import onto
 from motionfit._problem import During, Problem, Robust
 from motionfit._skeleton import SIDES
+from motionfit._solve import Block
 from motionfit._types import InputError
 from motionfit.adapt._clearance import Clearance, all_rows, counted_probes, kept_with, probe_depths, reduced, support
 from motionfit.adapt._controls import Turn, turn_controls

@@ -10,12 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from motionfit._character import Character
 from motionfit._control import Correction
-from motionfit._fit import Block, Fit, block_adjoint, block_solver, block_work, fit, solve_block
+from motionfit._fit import Fit, fit
 from motionfit._motion import Motion, host_kinematics, joint_angles
 from motionfit._onto import onto
 from motionfit._problem import During, Problem
 from motionfit._programs import program
 from motionfit._skeleton import SIDES
+from motionfit._solve import Block, block_adjoint, block_solver, block_work, solve_block
 from motionfit.adapt._clearance import probe_depths, reduced, support
 from motionfit.adapt._collisions import Group, eased, filled, known_depths, on_top, sinking_skin, skin_looks
 from motionfit.adapt._controls import Turn, turn_controls

@@ -10,11 +10,12 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
 
 from motionfit._character import Character
 from motionfit._control import Control, Correction
-from motionfit._fit import Block, Fit, fit
+from motionfit._fit import Fit, fit
 from motionfit._motion import Motion, host_kinematics
 from motionfit._onto import onto
 from motionfit._problem import During, Problem, Term
 from motionfit._skeleton import SIDES
+from motionfit._solve import Block
 from motionfit._types import InputError
 from motionfit.adapt._clearance import (
     Clearance,

@@ -28,13 +28,14 @@ from scipy.spatial.transform import Rotation
 
 from motionfit._character import Character
 from motionfit._control import Correction
-from motionfit._fit import Fit, Work, banded_solver, block_work
+from motionfit._fit import Fit
 from motionfit._fit import fit as refit
 from motionfit._motion import Motion, host_kinematics, rest_motion
 from motionfit._onto import onto
 from motionfit._problem import Energy, Problem
 from motionfit._programs import program
 from motionfit._skeleton import SIDES
+from motionfit._solve import Work, banded_solver, block_work
 from motionfit._types import InputError
 from motionfit.adapt._clearance import Clearance, build_clearance, volume_depths
 from motionfit.adapt._limbs import ALLOWED_EXCESS, LIMBS, SOLVE_PROBES, Stage

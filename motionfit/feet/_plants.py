@@ -11,6 +11,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from motionfit._files import whole
 from motionfit._skeleton import SIDES
 from motionfit._types import InputError
 from motionfit.feet._floor import Floor
@@ -82,14 +83,8 @@ def save_labels(path: str | os.PathLike, plants: Sequence[Plant]) -> None:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(HEADER)
     writer.writerows((p.foot, "any" if p.vertex is None else p.vertex, p.start, p.end) for p in plants)
-    path = pathlib.Path(path)
-    partial = path.with_name(path.name + ".part")
-    try:
+    with whole(path) as partial:
         partial.write_text(text.getvalue(), encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another path") from None
 
 
 def load_labels(path: str | os.PathLike, frame_count: int, dt: float) -> tuple[Plant, ...]:

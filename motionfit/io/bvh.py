@@ -9,6 +9,7 @@ import equinox as eqx
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from motionfit._files import whole
 from motionfit._motion import Motion, host_kinematics
 from motionfit._skeleton import Skeleton
 from motionfit._types import InputError
@@ -429,7 +430,8 @@ def write_bvh(path: str | os.PathLike, motion: Motion, *, unit: float | None = N
     lines += ["MOTION", f"Frames: {len(root)}", f"Frame Time: {float(motion.dt)!r}"]
     table = np.stack(columns, axis=1)
     lines += [" ".join(f"{x:.6f}" for x in row) for row in table + 0.0]
-    write_text(path, "\n".join(lines) + "\n")
+    with whole(path) as partial:
+        partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _decompose(order: str, quaternions: np.ndarray) -> np.ndarray:
@@ -480,20 +482,3 @@ def _hierarchy(skeleton: Skeleton, offsets, end_offsets, channels) -> list[str]:
 
     joint(0, 0)
     return lines
-
-
-def write_text(path: str | os.PathLike, text: str) -> None:
-    """Write a text file completely or not at all."""
-    write_bytes(path, text.encode("utf-8"))
-
-
-def write_bytes(path: str | os.PathLike, data: bytes) -> None:
-    """Write a file completely or not at all: beside its place first, then renamed."""
-    path = pathlib.Path(path)
-    partial = path.with_name(path.name + ".part")
-    try:
-        partial.write_bytes(data)
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True) if partial.is_file() else None
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None

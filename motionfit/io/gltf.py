@@ -13,12 +13,13 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from motionfit._character import Character
+from motionfit._files import whole
 from motionfit._motion import Motion, Source, bind_pose
 from motionfit._onto import onto
 from motionfit._skeleton import Skeleton
 from motionfit._skinning import Skin, vertex_normals
 from motionfit._types import InputError
-from motionfit.io.bvh import split_rest_frame, unreadable, write_bytes
+from motionfit.io.bvh import split_rest_frame, unreadable
 
 COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 SOURCE_OF = "motionfit_source_on"  # extras of an animation: the body that the first one was adapted to
@@ -557,7 +558,8 @@ def write_gltf(path: str | os.PathLike, motion: Motion, character: Character) ->
         buffer["uri"] = "data:application/octet-stream;base64," + base64.b64encode(bytes(writer.data)).decode()
     document["buffers"] = [buffer]
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-    write_bytes(path, _pack(text, bytes(writer.data)) if binary else text)
+    with whole(path) as partial:
+        partial.write_bytes(_pack(text, bytes(writer.data)) if binary else text)
 
 
 def _influences(skin: Skin):

@@ -1,7 +1,6 @@
 """motionfit's own lossless motion format: a NumPy archive with the skeleton and the motion."""
 
 import dataclasses
-import io
 import json
 import os
 import pathlib
@@ -9,11 +8,12 @@ import zipfile
 
 import numpy as np
 
+from motionfit._files import whole
 from motionfit._motion import Motion, Source
 from motionfit._onto import onto
 from motionfit._skeleton import Skeleton
 from motionfit._types import InputError
-from motionfit.io.bvh import unreadable, write_bytes
+from motionfit.io.bvh import unreadable
 
 KEYS = ("motionfit_motion", "offsets", "rest_rotations", "end_offsets", "root", "rotations", "dt")
 
@@ -40,9 +40,8 @@ def write_npz(path: str | os.PathLike, motion: Motion) -> None:
         arrays |= {"source_root": source.root, "source_rotations": source.rotations}
         if source.translations is not None:
             arrays["source_translations"] = source.translations
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **{k: np.asarray(v) for k, v in arrays.items()})  # pyright: ignore[reportArgumentType]: NumPy's stub
-    write_bytes(path, buffer.getvalue())
+    with whole(path) as partial, open(partial, "wb") as file:
+        np.savez_compressed(file, **{k: np.asarray(v) for k, v in arrays.items()})  # pyright: ignore[reportArgumentType]: NumPy's stub
 
 
 def read_npz(path: str | os.PathLike) -> Motion:

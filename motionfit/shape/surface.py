@@ -67,8 +67,7 @@ def find_inside(
         near = near[np.asarray(igl.fast_winding_number(vertices, triangles, points[near])) > 0.5]
     if len(near) == 0:
         return Inside(near, np.zeros(0), near, np.zeros((0, 3)))
-    corners = vertices[triangles]
-    return Inside(near, *_nearest(points[near], vertices, triangles, corners.min(1), corners.max(1)))
+    return Inside(near, *_nearest(points[near], vertices, triangles, *_spans(vertices, triangles)))
 
 
 def inside_depths(
@@ -93,13 +92,12 @@ def surface_gap(
     # the nearest vertex says which points and triangles can be nearer yet
     apart = cdist(points, vertices)
     near = apart.min(axis=1)
-    corners, bound = vertices[triangles], float(near.min())
-    low, high = corners.min(axis=1), corners.max(axis=1)
+    bound = float(near.min())
+    low, high = _spans(vertices, triangles)
     longest = float(np.linalg.norm(high - low, axis=1).max())
     some = near <= bound + longest
     box = points[some].min(axis=0) - bound, points[some].max(axis=0) + bound
-    close = ((high >= box[0]) & (low <= box[1])).all(axis=1)
-    squared = igl.point_mesh_squared_distance(points[some], vertices, triangles[close])[0]
+    squared = igl.point_mesh_squared_distance(points[some], vertices, triangles[_overlap(low, high, *box)])[0]
     return float(np.sqrt(max(float(np.min(squared)), 0.0)))
 
 
@@ -111,16 +109,16 @@ def may_be_inside(
     All around a point inside, at its own height along any axis, there is surface: that of its own slice or, where a
     triangle reaches over a border, of the next one. An opening is closed by what lies around it.
     """
-    box = vertices.min(0), vertices.max(0)
-    may = ((points >= box[0]) & (points <= box[1])).all(-1)
+    columns = np.ascontiguousarray(vertices.T)
+    may = _overlap(points, points, columns.min(1), columns.max(1))
     if not may.any():
         return may
     middle = vertices.mean(0)
     about = vertices - middle
     across, second, axis = np.linalg.eigh(about.T @ about)[1].T
     heights = about @ axis
-    at_corners = heights[triangles]
-    longest = float((at_corners.max(1) - at_corners.min(1)).max())
+    least, greatest = _spans(heights, triangles)
+    longest = float((greatest - least).max())
     low, length = float(heights.min()), float(np.ptp(heights))
     slices = int(np.clip(length / max(longest, 1e-9), 1, SLICES))
 
@@ -159,6 +157,25 @@ def _nearest(
         return distance, triangle, place
     # no point is further from the surface than from some of its vertices
     bound = cdist(points, vertices[triangles[::EVERY, 0]]).min(1)[:, None]
-    near = np.flatnonzero(((high >= (points - bound).min(0)) & (low <= (points + bound).max(0))).all(-1))
+    near = np.flatnonzero(_overlap(low, high, (points - bound).min(0), (points + bound).max(0)))
     squared, triangle, place = igl.point_mesh_squared_distance(points, vertices, triangles[near])
     return np.sqrt(np.maximum(np.asarray(squared), 0.0)), near[np.asarray(triangle)], np.asarray(place)
+
+
+# NumPy goes through an axis of length three one item at a time: a posed torso's boxes would take longer than its tree's
+# answers
+
+
+def _spans(values: Float[np.ndarray, "vertices *of"], triangles: Int[np.ndarray, "t 3"]):  # noqa: ANN202
+    """The least and the greatest of each triangle's corners."""
+    a, b, c = (values[corner] for corner in np.ascontiguousarray(triangles.T))
+    return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+
+
+def _overlap(
+    low: Float[np.ndarray, "boxes 3"], high: Float[np.ndarray, "boxes 3"], least: Float[np.ndarray, " 3"],
+    greatest: Float[np.ndarray, " 3"],
+) -> Bool[np.ndarray, " boxes"]:  # fmt: skip
+    """Which boxes reach into the one from `least` to `greatest`."""
+    inside = [(high[:, i] >= least[i]) & (low[:, i] <= greatest[i]) for i in range(3)]
+    return inside[0] & inside[1] & inside[2]

@@ -1,15 +1,14 @@
 """Pictures of feet: footprints, the path of the planted vertex over the sole, contact curves, snapshots, reach."""
 
 import os
-import pathlib
 from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
 
 from motionfit._character import Character
+from motionfit._files import whole
 from motionfit._motion import Motion
-from motionfit._types import InputError
 from motionfit.feet import FootFit, Footplants, Sole, find_sole, gather, sole_paths
 from motionfit.ik import plane_angles
 from motionfit.metrics import posed_vertices
@@ -24,15 +23,9 @@ def _save(path: str | os.PathLike, size: tuple[float | int, float | int], draw: 
     from matplotlib.figure import Figure  # not pyplot: that would need a backend, and a notebook has chosen its own
 
     figure = Figure(figsize=size, layout="constrained")
-    path = pathlib.Path(path)
-    partial = path.with_name(path.name + ".part")
-    try:
-        draw(figure)
+    draw(figure)
+    with whole(path) as partial:
         figure.savefig(partial, format="png", dpi=110)
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another path") from None
 
 
 def _outline(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "corners 2"]:

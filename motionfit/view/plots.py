@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from motionfit._character import PARTS, Character
+from motionfit._files import whole
 from motionfit._motion import Motion
-from motionfit._types import InputError
 from motionfit.metrics import TOLERANCE, posed_vertices
 
 SKIN = np.array([0.86, 0.70, 0.60])
@@ -90,14 +90,8 @@ def report_picture(
         axes.axis("off")
         axes.text(0.5, 0.5, "no pair of parts goes deeper than on the reference body", ha="center", fontsize=14)
     figure.suptitle(title, fontsize=14)
-    path = pathlib.Path(path)
-    partial = path.with_name(path.name + ".part")
-    try:
+    with whole(path) as partial:
         figure.savefig(partial, format="png", dpi=110)
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
 
 
 def _moments(excess: np.ndarray) -> list[int]:
