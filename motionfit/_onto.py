@@ -34,7 +34,7 @@ def onto(motion: Motion, skeleton: Skeleton) -> Motion:
     clip_positions, clip_rest = bind_pose(source)
     positions, bind_quaternions = bind_pose(skeleton)
     # turn the character's bind pose to face the way that the clip's rest pose faces
-    heading = _between(_facing(skeleton, positions), _facing(source, clip_positions))
+    heading = between(_facing(skeleton, positions), _facing(source, clip_positions))
     positions = heading.apply(positions)
     bind = heading * Rotation.from_quat(bind_quaternions, scalar_first=True)
 
@@ -71,7 +71,7 @@ def leg_length(skeleton: Skeleton, positions: Float[np.ndarray, "joints 3"] | No
     return float(total / 2)
 
 
-def _between(a: np.ndarray, b: np.ndarray) -> Rotation:
+def between(a: np.ndarray, b: np.ndarray) -> Rotation:
     """The smallest rotation that takes direction a to direction b."""
     a, b = (v / max(float(np.linalg.norm(v)), 1e-12) for v in (a, b))
     axis = np.cross(a, b)
@@ -113,7 +113,7 @@ def _alignments(
                 continue
             if kind == "foot":
                 mine, theirs = (v * np.array([1.0, 0.0, 1.0]) for v in (mine, theirs))
-            align[role] = _between(mine, theirs)
+            align[role] = between(mine, theirs)
             if heir:
                 align[f"{side}_{heir}"] = align[role]
     return align

@@ -11,6 +11,7 @@ from scipy.interpolate import BPoly, CubicSpline
 from scipy.spatial.transform import Rotation
 
 from motionfit._motion import Motion, bind_pose
+from motionfit._onto import between
 from motionfit._skeleton import Skeleton
 from motionfit._types import InputError
 from motionfit._walk_harmonics import HARMONICS
@@ -49,13 +50,6 @@ def _turn(role: str, phase: np.ndarray, side: str | None = None) -> np.ndarray:
     basis = np.stack([np.cos(angles), np.sin(angles)], axis=2).reshape(len(phase), -1)
     curve = rows[0] + basis @ rows[1:]
     return curve * np.array([1.0, -1.0, -1.0]) if side == "right" else curve
-
-
-def _between(a: np.ndarray, b: np.ndarray) -> Rotation:
-    axis = np.cross(a, b)
-    sine = np.linalg.norm(axis)
-    angle = np.arctan2(sine, a @ b)
-    return Rotation.from_rotvec(axis / sine * angle if sine > 1e-9 else np.zeros(3))
 
 
 class _Gait:
@@ -205,7 +199,7 @@ class _Gait:
             for role, end in (("upper_arm", "forearm"), ("forearm", "hand"), ("hand", None)):
                 a = joint[f"{side}_{role}"]
                 bone = self.bind[joint[f"{side}_{end}"]] - self.bind[a] if end else bone
-                laid = _between(bone / np.linalg.norm(bone), level)
+                laid = between(bone / np.linalg.norm(bone), level)
                 world[a] = Rotation.from_rotvec(_turn(role, phase, side)) * laid
             self._leg(side, phase, world)
         pelvis = self._pelvis(phase) + progress

@@ -11,7 +11,7 @@ from motionfit._character import Character
 from motionfit._motion import Motion, Source, bind_pose, resample
 from motionfit._skeleton import load_role_mapping
 from motionfit._types import InputError
-from motionfit.io.bvh import parse_bvh, read_bvh, write_bvh
+from motionfit.io.bvh import read_bvh, write_bvh
 from motionfit.io.npz import read_npz, write_npz
 
 CLIPS = (".bvh", ".glb", ".gltf", ".npz")
@@ -137,16 +137,20 @@ def describe(path: str | os.PathLike) -> dict:
         skeleton = motion.skeleton
         found["kind"] = "motion"
     if motion is not None:
-        rest = np.asarray(motion.skeleton.rest_rotations)
         found |= {"frames": motion.frame_count, "frame_rate": round(motion.frame_rate, 4),
                   "duration_s": round((motion.frame_count - 1) * float(motion.dt), 4)}  # fmt: skip
         if ending == ".bvh":
-            in_file = len(parse_bvh(path).values)
-            found |= {
-                "unit_m": motion.skeleton.file_unit,
-                "up": "z" if abs(abs(rest[0, 0]) - 1) > 1e-3 and in_file == motion.frame_count else "y",
-                "rest_frame": "T-pose first frame, not taken for motion" if in_file > motion.frame_count else "none",
-            }
+            plain = load_motion(path, rest_frame="none")
+            rest, as_read = (np.asarray(m.skeleton.rest_rotations) for m in (motion, plain))
+            found |= {"unit_m": motion.skeleton.file_unit, "up": "y" if abs(as_read[0, 0]) > 0.999 else "z"}
+            if plain.frame_count > motion.frame_count:
+                found["rest_pose"] = "T-pose first frame, not taken for motion"
+            elif np.array_equal(rest, as_read):
+                found["rest_pose"] = "all angles zero"
+            elif np.array_equal(rest[1:], as_read[1:]):
+                found["rest_pose"] = "all angles zero, set upright"
+            else:
+                found["rest_pose"] = "T-pose found from the motion: nobody could stand with all angles zero"
     positions = bind_pose(skeleton)[0]
     roles = {role: skeleton.names[joint] for role, joint in skeleton.roles}
     without = [n for j, n in enumerate(skeleton.names) if j not in skeleton.role_of_joint]

@@ -13,6 +13,7 @@ from motionfit._files import whole
 from motionfit._motion import Motion, host_kinematics
 from motionfit._skeleton import Skeleton
 from motionfit._types import InputError
+from motionfit.io._rest_pose import split_rest_frame, with_standing_rest
 
 CHANNELS = ("Xposition", "Yposition", "Zposition", "Xrotation", "Yrotation", "Zrotation")
 CMU_UNIT = 0.0564444  # [m]: ASF lengths of 0.45 make one unit 1/0.45 inch
@@ -253,7 +254,8 @@ def read_bvh(
 
     `unit` [m per file unit] and `up` ("y" or "z") override what the skeleton's size and posture suggest.
     `rest_frame`: "auto" takes a first frame in T- or A-pose that the motion does not lead on from for the rest
-    pose and not for motion, as in the CMU files; "first" always does, "none" never.
+    pose and not for motion, as in the CMU files; "first" always does, "none" never. Where nobody could stand in the
+    rest pose that the file gives then, one is found from the motion, but for "none".
     """
     file = parse_bvh(path)
     if up not in (None, "y", "z"):
@@ -286,7 +288,8 @@ def read_bvh(
     )  # fmt: skip
     moved = None if translations is None else translations * scale
     motion = Motion(skeleton, root * scale, rotations, np.asarray(file.frame_time), moved)
-    return split_rest_frame(motion, rest_frame)
+    motion = split_rest_frame(motion, rest_frame)
+    return motion if rest_frame == "none" else with_standing_rest(motion)
 
 
 def _local_transforms(file: BvhFile):
@@ -353,48 +356,6 @@ def _guess_unit(motion: Motion) -> float:
             # several can fit a child or a giant: the one nearest to an adult's leg
             return min(fitting, key=lambda u: abs(np.log(leg * u / 0.85)))
     return 1.0
-
-
-def split_rest_frame(motion: Motion, rest_frame: str = "auto") -> Motion:
-    """Take a first frame that is a rest pose out of the motion and keep it as the skeleton's rest pose."""
-    if motion.frame_count < 2 or rest_frame == "none":
-        return motion
-    if rest_frame == "auto" and not has_rest_frame(motion):
-        return motion
-    rest = np.asarray(motion.rotations)[0]
-    skeleton = eqx.tree_at(lambda s: s.rest_rotations, motion.skeleton, rest)
-    rotations, translations = motion.rotations[1:], motion.translations
-    return Motion(skeleton, motion.root[1:], rotations, motion.dt, None if translations is None else translations[1:])
-
-
-def has_rest_frame(motion: Motion) -> bool:
-    """True where frame 0 is a standing rest pose that frame 1 does not lead on from.
-
-    Legs straight and near vertical, arms straight and mirrored between level and 60 degrees down, trunk upright;
-    and the step to frame 1 is far larger than the steps after it.
-    """
-    skeleton = motion.skeleton
-    limbs = [(f"{s}_{a}", f"{s}_{b}", f"{s}_{c}") for s in ("left", "right")
-             for a, b, c in (("thigh", "calf", "foot"), ("upper_arm", "forearm", "hand"))]  # fmt: skip
-    if any(skeleton.find(r) is None for limb in limbs for r in limb):
-        return False
-    rotations = np.asarray(motion.rotations, float)[:12]
-    steps = 2 * np.arccos(np.clip(np.abs((rotations[1:] * rotations[:-1]).sum(-1)), 0, 1)).max(-1)
-    usual = np.median(steps[1:]) if len(steps) > 1 else 0.0
-    if np.rad2deg(steps[:1].max()) < max(8.0, 4 * np.rad2deg(usual)):
-        return False
-    positions = host_kinematics(motion[:1])[0][0]
-
-    def unit(a: str, b: str) -> np.ndarray:
-        v = positions[skeleton.joint(b)] - positions[skeleton.joint(a)]
-        return v / max(float(np.linalg.norm(v)), 1e-9)
-
-    straight = all(unit(a, b) @ unit(b, c) > np.cos(np.deg2rad(30)) for a, b, c in limbs)
-    legs = all(unit(a, c)[1] < -np.cos(np.deg2rad(20)) for a, _, c in limbs if "thigh" in a)
-    left, right = (unit(f"{s}_upper_arm", f"{s}_hand") for s in ("left", "right"))
-    level = all(-0.9 < v[1] < 0.35 for v in (left, right))
-    mirrored = abs(left[1] - right[1]) < 0.1 and left[[0, 2]] @ right[[0, 2]] < 0.3
-    return bool(straight and legs and level and mirrored)
 
 
 def write_bvh(path: str | os.PathLike, motion: Motion, *, unit: float | None = None) -> None:

@@ -19,7 +19,8 @@ from motionfit._onto import onto
 from motionfit._skeleton import Skeleton
 from motionfit._skinning import Skin, vertex_normals
 from motionfit._types import InputError
-from motionfit.io.bvh import split_rest_frame, unreadable
+from motionfit.io._rest_pose import split_rest_frame
+from motionfit.io.bvh import unreadable
 
 COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 SOURCE_OF = "motionfit_source_on"  # extras of an animation: the body that the first one was adapted to
