@@ -22,12 +22,14 @@ REQUIRED_ROLES = ("hips", "head", *(f"{s}_{r}" for s in SIDES for r in LIMB_ROLE
 # Joint names per convention, lower case without separators, `{s}` for the side's mark. To teach motionfit a new
 # rig, add an entry. `{s}` takes the marks of `sides`; `spine` and `neck` list the chains from below.
 CONVENTIONS: dict[str, dict] = {
-    "MotionBuilder/CMU": {  # also Mixamo, whose `mixamorig:` prefix is stripped
+    "MotionBuilder/CMU": {  # also Mixamo, whose `mixamorig:` prefix is stripped, and Rokoko
         "sides": ("left", "right"),
         "hips": ("hips",), "head": ("head",),
-        "spine": ("lowerback", "spine", "spine1", "spine2", "spine3"), "neck": ("neck", "neck1", "neck2"),
+        "spine": ("lowerback", "spine", "spine1", "spine2", "spine3", "spine4"),
+        "neck": ("neck", "neck1", "neck2"),
         "clavicle": ("{s}shoulder",), "upper_arm": ("{s}arm",), "forearm": ("{s}forearm",), "hand": ("{s}hand",),
-        "thigh": ("{s}upleg",), "calf": ("{s}leg",), "foot": ("{s}foot",), "toe": ("{s}toebase", "{s}toe"),
+        "thigh": ("{s}upleg", "{s}thigh"), "calf": ("{s}leg", "{s}shin"), "foot": ("{s}foot",),
+        "toe": ("{s}toebase", "{s}toe"),
     },
     "Character Studio Biped": {
         "sides": ("l", "r"),
@@ -50,13 +52,13 @@ CONVENTIONS: dict[str, dict] = {
         "clavicle": ("{s}collar",), "upper_arm": ("{s}shldr",), "forearm": ("{s}forearm",), "hand": ("{s}hand",),
         "thigh": ("{s}thigh",), "calf": ("{s}shin",), "foot": ("{s}foot",), "toe": ("{s}toe", "{s}toes"),
     },
-    "Blender/Rigify": {
+    "Blender/Rigify": {  # also Bandai-Namco
         "sides": ("l", "r"),
         "hips": ("pelvis", "hips", "spine"), "head": ("head",),
         "spine": ("spine", "spine001", "spine002", "spine003", "chest"), "neck": ("neck", "neck001", "spine004"),
         "clavicle": ("shoulder{s}",), "upper_arm": ("upperarm{s}",), "forearm": ("forearm{s}", "lowerarm{s}"),
-        "hand": ("hand{s}",), "thigh": ("thigh{s}",), "calf": ("shin{s}", "calf{s}"), "foot": ("foot{s}",),
-        "toe": ("toe{s}",),
+        "hand": ("hand{s}",), "thigh": ("thigh{s}", "upperleg{s}"), "calf": ("shin{s}", "calf{s}", "lowerleg{s}"),
+        "foot": ("foot{s}",), "toe": ("toe{s}", "toes{s}"),
     },
     "Unreal": {
         "sides": ("l", "r"),
@@ -65,11 +67,26 @@ CONVENTIONS: dict[str, dict] = {
         "forearm": ("lowerarm{s}",), "hand": ("hand{s}",), "thigh": ("thigh{s}",), "calf": ("calf{s}",),
         "foot": ("foot{s}",), "toe": ("ball{s}",),
     },
-    "SMPL": {
-        "sides": ("l", "r"),
+    **{name: {
+        "sides": sides,
         "hips": ("pelvis",), "head": ("head",), "spine": ("spine1", "spine2", "spine3"), "neck": ("neck",),
         "clavicle": ("{s}collar",), "upper_arm": ("{s}shoulder",), "forearm": ("{s}elbow",), "hand": ("{s}wrist",),
         "thigh": ("{s}hip",), "calf": ("{s}knee",), "foot": ("{s}ankle",), "toe": ("{s}foot",),
+    } for name, sides in (("SMPL", ("l", "r")), ("SMPL-X", ("left", "right")))},
+    **{name: {
+        "sides": sides,
+        **{role: tuple(middle + n for n in names) for role, names in (
+            ("hips", ("hips",)), ("head", ("head",)), ("spine", ("spine", "chest", "upperchest")), ("neck", ("neck",)))},
+        "clavicle": ("{s}shoulder",), "upper_arm": ("{s}upperarm",), "forearm": ("{s}lowerarm",),
+        "hand": ("{s}hand",), "thigh": ("{s}upperleg",), "calf": ("{s}lowerleg",), "foot": ("{s}foot",),
+        "toe": ("{s}toes", "{s}toebase"),
+    } for name, middle, sides in (("Unity", "", ("left", "right")), ("VRoid", "jbipc", ("jbipl", "jbipr")))},
+    "Acclaim (CMU)": {
+        "sides": ("l", "r"),
+        "hips": ("root", "hips"), "head": ("head",), "spine": ("lowerback", "upperback", "thorax"),
+        "neck": ("lowerneck", "upperneck"), "clavicle": ("{s}clavicle",), "upper_arm": ("{s}humerus",),
+        "forearm": ("{s}radius",), "hand": ("{s}wrist", "{s}hand"), "thigh": ("{s}femur",), "calf": ("{s}tibia",),
+        "foot": ("{s}foot",), "toe": ("{s}toes",),
     },
 }  # fmt: skip
 
