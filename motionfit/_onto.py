@@ -18,7 +18,7 @@ def onto(motion: Motion, skeleton: Skeleton) -> Motion:
     D = Q_clip Q_clip_rest^-1 and A is the smallest rotation that lays the character's bind bone along the clip's
     rest bone (a T-pose clip on an A-pose character). The trunk, neck and head stand upright in both and take
     A = 1, the foot only its yaw, so that soles stay flat; hands and toes go on like the bone before them. Joints
-    that only one side has stay at bind. The root path is scaled with the leg length.
+    that only one side has stay at bind. The path of the hips is scaled with the leg length.
 
     A skeleton that is truly the same gets the motion back bit for bit.
     """
@@ -151,17 +151,21 @@ def _targets(source: Skeleton, skeleton: Skeleton, away: list[Rotation]) -> dict
 
 
 def _root_path(motion: Motion, clip_positions: np.ndarray, skeleton: Skeleton, positions: np.ndarray) -> np.ndarray:
-    """The root path scaled with the leg length, its height measured between hip joints and ankles."""
+    """The path of the hips scaled with the leg length, its height measured between hip joints and ankles, as one of the
+    root. A root that is not the hips (on the floor, in game rigs) does not turn."""
     source = motion.skeleton
     scale = leg_length(skeleton, positions) / leg_length(source, clip_positions)
 
     def above_leg(s: Skeleton, p: np.ndarray) -> float:
-        """What of the root's height is not leg: root over the hip joints, ankle over the lowest toe."""
+        """What of the hips' height is not leg: hips over the hip joints, ankle over the lowest toe."""
         feet = [s.joint(f"{side}_foot") for side in SIDES]
         toes = [j for side in SIDES if (j := s.find(f"{side}_toe")) is not None] or feet
-        hips = np.mean([p[s.joint(f"{side}_thigh")][1] for side in SIDES])
-        return float(p[0][1] - hips + np.mean(p[feet, 1]) - np.min(p[toes, 1]))
+        joints = np.mean([p[s.joint(f"{side}_thigh")][1] for side in SIDES])
+        return float(p[s.joint("hips")][1] - joints + np.mean(p[feet, 1]) - np.min(p[toes, 1]))
 
-    root = np.asarray(motion.root, float) * scale
-    root[:, 1] += above_leg(skeleton, positions) - scale * above_leg(source, clip_positions)
-    return root
+    hips = source.joint("hips")
+    path = np.asarray(motion.root, float) if hips == 0 else host_kinematics(motion)[0][:, hips]
+    path = path * scale
+    path[:, 1] += above_leg(skeleton, positions) - scale * above_leg(source, clip_positions)
+    at_rest = bind_pose(skeleton)[0]
+    return path - (at_rest[skeleton.joint("hips")] - at_rest[0])

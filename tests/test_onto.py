@@ -59,3 +59,23 @@ def test_a_turned_rest_pose_walks_the_same_way(average):
                          end_parents=skeleton.end_parents, end_offsets=turn.apply(skeleton.end_offsets))  # fmt: skip
     placed = mf.onto(walk, turned)
     np.testing.assert_allclose(_directions(placed), _directions(walk), atol=1e-9)
+
+
+def test_hips_that_move_under_a_root_on_the_floor_take_the_body_along(average, heavy, tmp_path):
+    """As in game rigs: the root stays where it is, and the hips have a path of their own."""
+    walk = samples.walk(cycles=1)
+    skeleton, frames = walk.skeleton, walk.frame_count
+    unturned = np.array([[1.0, 0.0, 0.0, 0.0]])
+    offsets = np.concatenate([np.zeros((1, 3)), skeleton.offsets])
+    rooted = mf.Skeleton(("Root", *skeleton.names), (-1, *(p + 1 for p in skeleton.parents)), offsets,
+                         np.concatenate([unturned, skeleton.rest_rotations]))  # fmt: skip
+    places = np.tile(offsets, (frames, 1, 1))
+    places[:, 1] = walk.root
+    rotations = np.concatenate([np.tile(unturned, (frames, 1, 1)), walk.rotations], axis=1)
+    clip = mf.Motion(rooted, np.zeros((frames, 3)), rotations, walk.dt, places)
+    mf.save(tmp_path / "rooted.bvh", clip)
+    expected = host_kinematics(mf.onto(walk, heavy.skeleton))[0]
+    for motion, atol in ((clip, 1e-9), (mf.load_motion(tmp_path / "rooted.bvh"), 1e-4)):
+        np.testing.assert_allclose(host_kinematics(mf.onto(motion, heavy.skeleton))[0], expected, atol=atol)
+    # and the other way round: such a body goes where the hips of a clip go
+    np.testing.assert_allclose(host_kinematics(mf.onto(walk, rooted))[0][:, 1:], host_kinematics(walk)[0], atol=1e-9)
