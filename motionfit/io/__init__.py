@@ -99,7 +99,7 @@ def save(path: str | os.PathLike, motion: Motion, character: Character | None = 
         if character is None:
             raise InputError(f"{path}: a {ending} holds a skinned character; call save(path, motion, character), "
                              "or write .bvh or .npz")  # fmt: skip
-        from motionfit.io.gltf import write_gltf
+        from motionfit.io.gltf_write import write_gltf
 
         write_gltf(path, motion, character)
     elif ending == ".bvh":
