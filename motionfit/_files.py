@@ -20,8 +20,9 @@ def whole(path: str | os.PathLike) -> Iterator[pathlib.Path]:
     try:
         yield partial
         partial.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another path") from None
-    finally:
+    except BaseException as error:
         if partial.is_file():
             partial.unlink()
+        if not isinstance(error, OSError):
+            raise
+        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another path") from None

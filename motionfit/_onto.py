@@ -39,7 +39,7 @@ def onto(motion: Motion, skeleton: Skeleton) -> Motion:
     bind = heading * Rotation.from_quat(bind_quaternions, scalar_first=True)
 
     frames = motion.frame_count
-    world = host_kinematics(motion)[1]
+    clip_path, world = host_kinematics(motion)
     rest = Rotation.from_quat(clip_rest, scalar_first=True)
     away = [Rotation.from_quat(world[:, j], scalar_first=True) * rest[j].inv() for j in range(world.shape[1])]  # D
     align = _alignments(source, clip_positions, skeleton, positions)
@@ -57,7 +57,10 @@ def onto(motion: Motion, skeleton: Skeleton) -> Motion:
         else:
             local[:, joint] = rest_local[joint].as_quat(scalar_first=True)
             turned.append(above * rest_local[joint])
-    return Motion(skeleton, _root_path(motion, clip_positions, skeleton, positions), local, motion.dt)
+    path = _hips_path(source, clip_path[:, source.joint("hips")], clip_positions, skeleton, positions)
+    if (hips := skeleton.joint("hips")) != 0:  # under a root on the floor, as in game rigs
+        path = path - host_kinematics(Motion(skeleton, np.zeros_like(path), local, motion.dt))[0][:, hips]
+    return Motion(skeleton, path, local, motion.dt)
 
 
 def leg_length(skeleton: Skeleton, positions: Float[np.ndarray, "joints 3"] | None = None) -> float:
@@ -150,10 +153,11 @@ def _targets(source: Skeleton, skeleton: Skeleton, away: list[Rotation]) -> dict
     return targets
 
 
-def _root_path(motion: Motion, clip_positions: np.ndarray, skeleton: Skeleton, positions: np.ndarray) -> np.ndarray:
-    """The path of the hips scaled with the leg length, its height measured between hip joints and ankles, as one of the
-    root. A root that is not the hips (on the floor, in game rigs) does not turn."""
-    source = motion.skeleton
+def _hips_path(
+    source: Skeleton, clip_path_world: Float[np.ndarray, "frames 3"], clip_positions: Float[np.ndarray, "clip_joints 3"],
+    skeleton: Skeleton, positions: Float[np.ndarray, "joints 3"],
+) -> Float[np.ndarray, "frames 3"]:  # fmt: skip
+    """The path [m] of the clip's hips scaled with the leg length, its height measured between hip joints and ankles."""
     scale = leg_length(skeleton, positions) / leg_length(source, clip_positions)
 
     def above_leg(s: Skeleton, p: np.ndarray) -> float:
@@ -163,9 +167,6 @@ def _root_path(motion: Motion, clip_positions: np.ndarray, skeleton: Skeleton, p
         joints = np.mean([p[s.joint(f"{side}_thigh")][1] for side in SIDES])
         return float(p[s.joint("hips")][1] - joints + np.mean(p[feet, 1]) - np.min(p[toes, 1]))
 
-    hips = source.joint("hips")
-    path = np.asarray(motion.root, float) if hips == 0 else host_kinematics(motion)[0][:, hips]
-    path = path * scale
+    path = clip_path_world * scale
     path[:, 1] += above_leg(skeleton, positions) - scale * above_leg(source, clip_positions)
-    at_rest = bind_pose(skeleton)[0]
-    return path - (at_rest[skeleton.joint("hips")] - at_rest[0])
+    return path

@@ -333,7 +333,7 @@ def _write_json(path: pathlib.Path, data: dict) -> None:
     from motionfit._files import whole
 
     with whole(path) as partial:
-        partial.write_text(json.dumps(_finite(data), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        partial.write_text(json.dumps(_finite(data), indent=2, allow_nan=False) + "\n", encoding="utf-8", newline="\n")
 
 
 def _print_table(columns: dict[str, dict]) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 import motionfit as mf
 from motionfit import samples, view
+from motionfit._files import whole
 from motionfit.cli import main
 
 BVH = """HIERARCHY
@@ -192,8 +193,8 @@ def test_broken_gltf(good, spoil, fact, monkeypatch, capsys, tmp_path):
 
 def test_truncated_glb(monkeypatch, capsys, tmp_path):
     mf.save(tmp_path / "body.glb", samples.walk(cycles=1), mf.load_character("builtin:child"))
-    whole = (tmp_path / "body.glb").read_bytes()
-    (tmp_path / "body.glb").write_bytes(whole[: len(whole) // 2])
+    data = (tmp_path / "body.glb").read_bytes()
+    (tmp_path / "body.glb").write_bytes(data[: len(data) // 2])
     _refused(monkeypatch, capsys, tmp_path, "builtin:walk", tmp_path / "body.glb", "cut off")
 
 
@@ -225,3 +226,13 @@ def test_what_cannot_be_written_whole_leaves_the_old_file_and_nothing_beside_it(
     save(old)
     assert old.read_bytes() != b"what was there before"
     assert [file.name for file in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize(
+    ("error", "told"), [(OSError(28, "No space left on device"), mf.InputError), (KeyError("x"), KeyError)]
+)
+def test_a_file_that_breaks_off_halfway_is_not_there(error, told, tmp_path):
+    with pytest.raises(told), whole(tmp_path / "clip.bvh") as partial:
+        partial.write_bytes(b"half of it")
+        raise error
+    assert list(tmp_path.iterdir()) == []

@@ -84,7 +84,7 @@ def save_labels(path: str | os.PathLike, plants: Sequence[Plant]) -> None:
     writer.writerow(HEADER)
     writer.writerows((p.foot, "any" if p.vertex is None else p.vertex, p.start, p.end) for p in plants)
     with whole(path) as partial:
-        partial.write_text(text.getvalue(), encoding="utf-8")
+        partial.write_text(text.getvalue(), encoding="utf-8", newline="\n")
 
 
 def load_labels(path: str | os.PathLike, frame_count: int, dt: float) -> tuple[Plant, ...]:

@@ -35,8 +35,9 @@ def load_motion(
 ) -> Motion:
     """Read a motion clip: .bvh, .glb, .gltf, or motionfit's own .npz.
 
-    `unit` [m per file unit] and `up` ("y", "z") override what a BVH seems to use; `rest_frame` says whether a
-    first frame in T-pose is motion ("auto", "first", "none"); `roles` is a mapping role -> joint name, or a JSON
+    `unit` [m per file unit] and `up` ("y", "z") override what a BVH seems to use; `rest_frame` says what a
+    BVH's skeleton rests in: a first frame in T-pose, or a pose found where the file's is none to stand in ("auto"), the
+    first frame ("first"), all angles zero ("none"); `roles` is a mapping role -> joint name, or a JSON
     file with one. `start`, `end` [s] cut the clip and `fps` [1/s] resamples it.
     """
     names = load_role_mapping(roles) if isinstance(roles, str | os.PathLike) else roles

@@ -18,6 +18,7 @@ from motionfit._skeleton import SIDES, Skeleton
 ENOUGH = 500  # frames that a rest pose is found from
 NO_HINGE = 0.1  # sine of the bend below which a limb's own plane says less than the joint above it
 STILL, LOW = 0.2, 0.03  # [m/s], [m]: an ankle as slow, and as low, stands
+SURELY = 0.1  # of 1: a foot that is never as sure to stand does not
 X, Y, Z = np.eye(3)
 ASKEW = np.array([0.36, 0.48, 0.8])
 ELBOW = np.array(
@@ -44,9 +45,9 @@ def has_rest_frame(motion: Motion) -> bool:
     and the step to frame 1 is far larger than the steps after it.
     """
     skeleton = motion.skeleton
-    limbs = [(f"{s}_{a}", f"{s}_{b}", f"{s}_{c}") for s in ("left", "right")
+    limbs = [(f"{s}_{a}", f"{s}_{b}", f"{s}_{c}") for s in SIDES
              for a, b, c in (("thigh", "calf", "foot"), ("upper_arm", "forearm", "hand"))]  # fmt: skip
-    if any(skeleton.find(r) is None for limb in limbs for r in limb):
+    if any(skeleton.find(r) is None for limb in (("hips", "head"), *limbs) for r in limb):
         return False
     rotations = np.asarray(motion.rotations, float)[:12]
     steps = 2 * np.arccos(np.clip(np.abs((rotations[1:] * rotations[:-1]).sum(-1)), 0, 1)).max(-1)
@@ -56,15 +57,14 @@ def has_rest_frame(motion: Motion) -> bool:
     positions = host_kinematics(motion[:1])[0][0]
 
     def unit(a: str, b: str) -> np.ndarray:
-        v = positions[skeleton.joint(b)] - positions[skeleton.joint(a)]
-        return v / max(float(np.linalg.norm(v)), 1e-9)
+        return _unit(positions[skeleton.joint(b)] - positions[skeleton.joint(a)])
 
     straight = all(unit(a, b) @ unit(b, c) > np.cos(np.deg2rad(30)) for a, b, c in limbs)
     legs = all(unit(a, c)[1] < -np.cos(np.deg2rad(20)) for a, _, c in limbs if "thigh" in a)
     left, right = (unit(f"{s}_upper_arm", f"{s}_hand") for s in ("left", "right"))
     level = all(-0.9 < v[1] < 0.35 for v in (left, right))
     mirrored = abs(left[1] - right[1]) < 0.1 and left[[0, 2]] @ right[[0, 2]] < 0.3
-    return bool(straight and legs and level and mirrored)
+    return bool(straight and legs and level and mirrored and unit("hips", "head")[1] > np.cos(np.deg2rad(30)))
 
 
 def with_standing_rest(motion: Motion) -> Motion:
@@ -75,17 +75,26 @@ def with_standing_rest(motion: Motion) -> Motion:
     if any(skeleton.find(role) is None for role in ("hips", "chest", "head", *limbs)):
         return motion
     positions = bind_pose(skeleton)[0]
-    up = _unit(positions[skeleton.joint("head")] - positions[skeleton.joint("hips")])
+    trunk = _unit(positions[skeleton.joint("head")] - positions[skeleton.joint("hips")])
     legs = [_unit(positions[skeleton.joint(f"{s}_foot")] - positions[skeleton.joint(f"{s}_thigh")]) for s in SIDES]
-    if not all(leg @ up < -0.5 for leg in legs):
+    up = _unit(2.0 * trunk - sum(legs))
+    if not all(leg @ trunk < -0.5 for leg in legs):
         rest = t_pose_of(motion)
-    elif up[1] < 0.7:
+    elif up[1] < 0.5:
         rest = np.array(skeleton.rest_rotations)
         axis = np.sign(up) * (np.abs(up) == np.abs(up).max())  # files lie by quarter turns
         rest[0] = (between(axis, Y) * Rotation.from_quat(rest[0], scalar_first=True)).as_quat(scalar_first=True)
     else:
         return motion
     return dataclasses.replace(motion, skeleton=eqx.tree_at(lambda s: s.rest_rotations, skeleton, rest))
+
+
+def is_found_again(motion: Motion) -> bool:
+    """Whether the rest pose is the one that would be found if the file told none."""
+    rest = np.asarray(motion.skeleton.rest_rotations, float)
+    zero = eqx.tree_at(lambda s: s.rest_rotations, motion.skeleton, np.zeros_like(rest) + [1.0, 0.0, 0.0, 0.0])
+    found = with_standing_rest(dataclasses.replace(motion, skeleton=zero)).skeleton.rest_rotations
+    return bool((np.abs((np.asarray(found) * rest).sum(axis=1)) > 1.0 - 1e-9).all())
 
 
 def t_pose_of(motion: Motion) -> Float[np.ndarray, "joints 4"]:
@@ -95,9 +104,10 @@ def t_pose_of(motion: Motion) -> Float[np.ndarray, "joints 4"]:
     Q_rest is the mean over the frames of D_t^-1 Q_t. What no part is known of (hands, fingers) goes straight on.
     """
     skeleton = motion.skeleton
-    seen = motion[:: -(-motion.frame_count // ENOUGH)]
+    every = -(-motion.frame_count // ENOUGH)
+    seen = motion[::every]
     positions, rotations = host_kinematics(seen)
-    away, weights = _turned_away(skeleton, positions, float(seen.dt))
+    away, weights = _turned_away(skeleton, positions, float(seen.dt) * every)
     known = {skeleton.joint(role): d for role, d in away.items()}
     carrying = {j for joint in known for j in _path(skeleton, joint)}
     rest: list[Rotation] = []
@@ -156,10 +166,15 @@ def _turned_away(
             untwisted = _carried(away[carrier].apply(hinge), away[carrier].apply(along), first)
             plane = np.cross(first, second) + NO_HINGE * untwisted
             away[upper], away[lower] = (_frame(b, plane) * _frame(along, hinge).inv() for b in (first, second))
-        foot, toe = f"{side}_foot", f"{side}_toe"
-        if skeleton.find(toe) is not None:
-            away[foot] = away[toe] = _frame(Y, bone(foot, toe)) * _frame(Y, Z).inv()
-            weights[foot] = weights[toe] = stands_on
+        foot, toe, calf = f"{side}_foot", f"{side}_toe", f"{side}_calf"
+        has_toe = skeleton.find(toe) is not None
+        if stands_on.max() < SURELY:
+            away[foot] = away[calf]  # never seen to stand: on the mean at right angles to the shank
+        else:
+            ahead = bone(foot, toe) if has_toe else away[calf].apply(Z)
+            away[foot], weights[foot] = _frame(Y, ahead) * _frame(Y, Z).inv(), stands_on
+        if has_toe:
+            away[toe], weights[toe] = away[foot], weights.get(foot, stands)
     return away, weights
 
 

@@ -13,7 +13,7 @@ from motionfit._files import whole
 from motionfit._motion import Motion, host_kinematics
 from motionfit._skeleton import Skeleton
 from motionfit._types import InputError
-from motionfit.io._rest_pose import split_rest_frame, with_standing_rest
+from motionfit.io._rest_pose import is_found_again, split_rest_frame, with_standing_rest
 
 CHANNELS = ("Xposition", "Yposition", "Zposition", "Xrotation", "Yrotation", "Zrotation")
 CMU_UNIT = 0.0564444  # [m]: ASF lengths of 0.45 make one unit 1/0.45 inch
@@ -254,8 +254,9 @@ def read_bvh(
 
     `unit` [m per file unit] and `up` ("y" or "z") override what the skeleton's size and posture suggest.
     `rest_frame`: "auto" takes a first frame in T- or A-pose that the motion does not lead on from for the rest
-    pose and not for motion, as in the CMU files; "first" always does, "none" never. Where nobody could stand in the
-    rest pose that the file gives then, one is found from the motion, but for "none".
+    pose and not for motion, as in the CMU files; "first" always does, "none" never. With "auto" a
+    rest pose that lies is set upright, and where nobody could stand in it a T-pose is found from the motion (of
+    skeletons with hips, chest, head and all parts of the limbs).
     """
     file = parse_bvh(path)
     if up not in (None, "y", "z"):
@@ -289,7 +290,7 @@ def read_bvh(
     moved = None if translations is None else translations * scale
     motion = Motion(skeleton, root * scale, rotations, np.asarray(file.frame_time), moved)
     motion = split_rest_frame(motion, rest_frame)
-    return motion if rest_frame == "none" else with_standing_rest(motion)
+    return with_standing_rest(motion) if rest_frame == "auto" else motion
 
 
 def _local_transforms(file: BvhFile):
@@ -362,7 +363,8 @@ def write_bvh(path: str | os.PathLike, motion: Motion, *, unit: float | None = N
     """Write a motion as BVH, in the unit [m] and channels that its skeleton was read with (else 1 m, Z Y X).
 
     A skeleton whose rest pose is not the zero pose has it written as the first frame, as the CMU files do, since
-    the format has no other place for it; reading takes it out again.
+    the format has no other place for it; reading takes it out again where the motion does not lead on from it. A rest
+    pose that reading would find from the motion itself is not written.
     """
     skeleton = motion.skeleton
     scale = 1.0 / (unit or skeleton.file_unit)
@@ -370,7 +372,7 @@ def write_bvh(path: str | os.PathLike, motion: Motion, *, unit: float | None = N
     root, rotations = np.asarray(motion.root, float) * scale, np.asarray(motion.rotations, float)
     translations = None if motion.translations is None else np.asarray(motion.translations, float) * scale
     rest = np.asarray(skeleton.rest_rotations, float)
-    if np.abs(np.abs(rest[:, 0]) - 1).max() > 1e-9:
+    if np.abs(np.abs(rest[:, 0]) - 1).max() > 1e-9 and not is_found_again(motion):
         rotations, root = np.concatenate([rest[None], rotations]), np.concatenate([root[:1], root])
         if translations is not None:
             translations = np.concatenate([translations[:1], translations])
@@ -392,7 +394,7 @@ def write_bvh(path: str | os.PathLike, motion: Motion, *, unit: float | None = N
     table = np.stack(columns, axis=1)
     lines += [" ".join(f"{x:.6f}" for x in row) for row in table + 0.0]
     with whole(path) as partial:
-        partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        partial.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
 
 
 def _decompose(order: str, quaternions: np.ndarray) -> np.ndarray:

@@ -162,12 +162,9 @@ def _nearest(
     return np.sqrt(np.maximum(np.asarray(squared), 0.0)), near[np.asarray(triangle)], np.asarray(place)
 
 
-# NumPy goes through an axis of length three one item at a time: a posed torso's boxes would take longer than its tree's
-# answers
-
-
 def _spans(values: Float[np.ndarray, "vertices *of"], triangles: Int[np.ndarray, "t 3"]):  # noqa: ANN202
-    """The least and the greatest of each triangle's corners."""
+    """The least and the greatest of each triangle's corners: column by column, since NumPy goes through an axis of
+    length three one item at a time, and a posed torso's boxes would take longer than its tree's answers."""
     a, b, c = (values[corner] for corner in np.ascontiguousarray(triangles.T))
     return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
 
@@ -176,6 +173,6 @@ def _overlap(
     low: Float[np.ndarray, "boxes 3"], high: Float[np.ndarray, "boxes 3"], least: Float[np.ndarray, " 3"],
     greatest: Float[np.ndarray, " 3"],
 ) -> Bool[np.ndarray, " boxes"]:  # fmt: skip
-    """Which boxes reach into the one from `least` to `greatest`."""
+    """Which boxes reach into the one from `least` to `greatest`; column by column too."""
     inside = [(high[:, i] >= least[i]) & (low[:, i] <= greatest[i]) for i in range(3)]
     return inside[0] & inside[1] & inside[2]
