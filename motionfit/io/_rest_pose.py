@@ -21,9 +21,8 @@ STILL, LOW = 0.2, 0.03  # [m/s], [m]: an ankle as slow, and as low, stands
 SURELY = 0.1  # of 1: a foot that is never as sure to stand does not
 X, Y, Z = np.eye(3)
 ASKEW = np.array([0.36, 0.48, 0.8])
-ELBOW = np.array(
-    [0.0, -np.sqrt(0.75), 0.5]
-)  # what a left elbow bends about in T-pose, 30 degrees up, as in CMU's files
+# what a left elbow bends about in T-pose: the forearm goes ahead and 30 degrees up, as in CMU's files
+ELBOW = np.array([0.0, -np.sqrt(0.75), 0.5])
 
 
 def split_rest_frame(motion: Motion, rest_frame: str = "auto") -> Motion:

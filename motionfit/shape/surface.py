@@ -162,7 +162,9 @@ def _nearest(
     return np.sqrt(np.maximum(np.asarray(squared), 0.0)), near[np.asarray(triangle)], np.asarray(place)
 
 
-def _spans(values: Float[np.ndarray, "vertices *of"], triangles: Int[np.ndarray, "t 3"]):  # noqa: ANN202
+def _spans(
+    values: Float[np.ndarray, "vertices *of"], triangles: Int[np.ndarray, "t 3"]
+) -> tuple[Float[np.ndarray, "t *of"], Float[np.ndarray, "t *of"]]:
     """The least and the greatest of each triangle's corners: column by column, since NumPy goes through an axis of
     length three one item at a time, and a posed torso's boxes would take longer than its tree's answers."""
     a, b, c = (values[corner] for corner in np.ascontiguousarray(triangles.T))
