@@ -90,11 +90,17 @@ class During(Term):
         return rows * jnp.asarray(self.mask).reshape(-1, *(1,) * (rows.ndim - 1))
 
 
-class Robust(Term):
-    """Another term under the pseudo-Huber loss: quadratic for small rows, linear beyond `c` (dimensionless).
+def pseudo_huber(rows: Float[Array, "*rows"], c: Float[Array, ""]) -> Float[Array, "*rows"]:
+    """Rows r whose square is quadratic where they are small and linear beyond `c`:
+    1/2 rho(r)^2 = c^2 (sqrt(1 + (r/c)^2) - 1)."""
+    scaled = rows / c
+    # 2 (sqrt(1+s^2) - 1) = 2 s^2 / (sqrt(1+s^2) + 1): no cancellation for small s, and its root is
+    # s * sqrt(2 / (...)), which keeps the sign and is smooth at zero
+    return c * scaled * jnp.sqrt(2.0 / (jnp.sqrt(1.0 + scaled * scaled) + 1.0))
 
-    With 1/2 rho(r)^2 = c^2 (sqrt(1 + (r/c)^2) - 1), so the squared output is the loss itself.
-    """
+
+class Robust(Term):
+    """Another term under the pseudo-Huber loss: quadratic for small rows, linear beyond `c` (dimensionless)."""
 
     term: Term
     c: Float[AnyArray, ""] = eqx.field(converter=_array, default=2.0)
@@ -104,10 +110,7 @@ class Robust(Term):
         return self.term.reach
 
     def residual(self, kin: Kinematics) -> Float[Array, "frames ..."]:
-        scaled = self.term.residual(kin) / self.c
-        # 2 (sqrt(1+s^2) - 1) = 2 s^2 / (sqrt(1+s^2) + 1): no cancellation for small s, and its root is
-        # s * sqrt(2 / (...)), which keeps the sign and is smooth at zero
-        return jnp.asarray(self.c) * scaled * jnp.sqrt(2.0 / (jnp.sqrt(1.0 + scaled * scaled) + 1.0))
+        return pseudo_huber(self.term.residual(kin), jnp.asarray(self.c))
 
 
 class Problem(eqx.Module):

@@ -16,7 +16,6 @@ import typer
 if TYPE_CHECKING:
     from motionfit._fit import BlockReport
 
-DEFAULT_BLOCKS = "arms,legs,footskate,balance"  # motionfit.adapt.DEFAULT, which takes seconds to import
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False,
                   help="Adapt motion clips to the shape of a character.")  # fmt: skip
 
@@ -53,8 +52,12 @@ def adapt(
     ] = None,
     reference: Annotated[str | None, typer.Option(help="the body that the clip was made for")] = None,
     blocks: Annotated[
-        str, typer.Option(help="some of arms,legs,forearm,collisions,footskate,balance; all; or none")
-    ] = DEFAULT_BLOCKS,
+        str | None,
+        typer.Option(
+            help="some of arms,legs,forearm,collisions,footskate,balance; all; or none. Left out: all but forearm, and "
+            "collisions only where a hand touches the head, the other arm or hand"
+        ),
+    ] = None,
     objective: Annotated[str, typer.Option(help="vertex, capsule or joint")] = "vertex",
     fps: Annotated[float | None, typer.Option(help="resample the clip to this frame rate [1/s]")] = None,
     start: Annotated[float | None, typer.Option(help="cut the clip from here [s]")] = None,
@@ -176,7 +179,7 @@ def footskate(
 
 def run_adapt(
     clip: str, character: str, *, out: pathlib.Path, girth: str | None = None, reference: str | None = None,
-    blocks: str = DEFAULT_BLOCKS, objective: str = "vertex", fps: float | None = None, start: float | None = None,
+    blocks: str | None = None, objective: str = "vertex", fps: float | None = None, start: float | None = None,
     end: float | None = None, unit: float | None = None, up: str | None = None, roles: pathlib.Path | None = None,
     report: pathlib.Path | None = None, plot: pathlib.Path | None = None,
 ) -> None:  # fmt: skip
@@ -195,7 +198,9 @@ def run_adapt(
         if target is not None and not target.parent.is_dir():
             raise InputError(f"{target}: its folder does not exist; make it first: mkdir -p {target.parent}")
     whole = {"none": (), "all": mf.adapt.BLOCKS}
-    names = whole.get(blocks.strip(), tuple(b.strip() for b in blocks.split(",") if b.strip()))
+    names = None
+    if blocks is not None:
+        names = whole.get(blocks.strip(), tuple(b.strip() for b in blocks.split(",") if b.strip()))
     scales = parse_girth(girth) if girth else {}
     started = time.perf_counter()
     motion = _load_clip(clip, unit=unit, up=up, roles=roles, start=start, end=end, fps=fps)
@@ -211,7 +216,7 @@ def run_adapt(
         began = time.perf_counter()
         step = progress.task("adapting", None)
         fit = mf.adapt(motion, body, reference=other, blocks=names, objective=objective,
-                       progress=lambda name, done, total: step(done, total)) if names else None  # fmt: skip
+                       progress=lambda name, done, total: step(done, total)) if names != () else None  # fmt: skip
         progress.done("adapting")
         solve = time.perf_counter() - began
         motions = {"before": base, "after": base if fit is None else fit.motion}
@@ -244,7 +249,7 @@ def run_adapt(
     typer.echo(
         f"{status.replace('_', ' ')} in {total:.1f} s; wrote " + ", ".join(str(p) for p in (out, report, plot) if p)
     )
-    if status != "converged" and names:
+    if status != "converged" and fit is not None:
         raise typer.Exit(3)
 
 

@@ -33,12 +33,6 @@ def test_every_public_name_is_there_and_documented():
         assert getattr(mf, name).__doc__, name
 
 
-def test_the_command_line_runs_the_same_blocks_by_default():
-    from motionfit.cli import DEFAULT_BLOCKS
-
-    assert DEFAULT_BLOCKS == ",".join(mf.adapt.DEFAULT)
-
-
 def test_adapt_is_a_verb_and_a_folder():
     assert callable(mf.adapt) and callable(mf.adapt.arms) and callable(mf.adapt.legs)
 

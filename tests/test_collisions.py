@@ -17,13 +17,25 @@ from motionfit._control import Correction
 from motionfit._motion import Motion, host_kinematics, joint_angles, rest_motion
 from motionfit._solve import block_adjoint, block_solver, block_work, solve_block
 from motionfit.adapt import Group, Sphere, Turn, multi_start
-from motionfit.adapt._collisions import GROUPS, arm_turns, eased, known_depths, on_top, sinking_skin, skin_looks
+from motionfit.adapt._collisions import (
+    ROUNDS,
+    Attempt,
+    between,
+    eased,
+    hands_meet,
+    on_top,
+    sinking_skin,
+    skin_looks,
+    without_arms,
+)
 from motionfit.adapt._controls import turn_controls
+from motionfit.adapt._groups import GROUPS, MOST, PROBES, Meetings, arm_turns, known_depths
 from motionfit.adapt._sampling import sampling
 from motionfit.metrics import skin_depths, skin_gaps
 from motionfit.shape.pairs import Pair
 from motionfit.splines import bspline_basis
-from motionfit.terms import Direction, SkinContact
+from motionfit.terms import Direction
+from motionfit.terms.penetration import hinge
 from tests.helpers import central_difference, random_motion
 
 RELATIVE = 1e-5  # analytic against central differences in double precision
@@ -76,11 +88,12 @@ def test_what_sinks_in_on_the_skin_gives_way_there_and_nowhere_else(average):
     whole, looks, small = on_top(so_far, mine, at), skin_looks(base, average, average, at), at.motion(base)
     assert looks is not None
     looks.look_closer(joint_angles(at.motion(whole.motion), small).max(axis=1))
-    result = eased(so_far, mine, at, 2 / 60, sinking_skin(looks, small, at))
+    result = eased("eased", so_far, whole, at, sinking_skin(looks, small, at))
 
     own = skin_depths(average, base, step=2).depth
     excess = [(skin_depths(average, fit.motion, step=2).depth - own).max() for fit in (whole, result)]
     assert excess[0] > 0.02 and excess[1] < 0.011
+    np.testing.assert_allclose(result.correction.apply(result.base).rotations, result.motion.rotations, atol=1e-12)
     quarter = base.frame_count // 4
     turned, asked = (joint_angles(fit.motion, base).max(axis=1)[[quarter, 3 * quarter]] for fit in (result, whole))
     assert asked.min() > 0.25 and turned[0] < 0.7 * asked[0] and turned[1] > 0.99 * asked[1]
@@ -190,25 +203,132 @@ def test_direction_is_the_thesis_s_objective_and_has_its_gradient():
     np.testing.assert_allclose(jax.grad(cost)(x), central_difference(cost, x), rtol=RELATIVE, atol=1e-8)
 
 
+def _contact(average, motion, groups, allowed, gap, weight, spacing=2 / 60):
+    """A group's rows in a solve of all frames."""
+    known, at = known_depths(average, groups), sampling(motion, spacing)
+    meetings, probes = Meetings(known, at), known.probe_depths(motion)
+    meetings.seen(probes, np.zeros(probes.shape[:2]), known.rows(probes))
+    return known, at, meetings.term(allowed, gap, weight)
+
+
 def test_contact_asks_only_for_what_was_lost(average):
     motion = mf.onto(samples.walk(cycles=1), average.skeleton)[:3]
-    known = known_depths(average, (Group("x", ("left_hand",), ("left_thigh",), ()),))
-    skin = eqx.tree_at(lambda t: t.allowed, known.clearance.term, (np.zeros((3, 1)),))
-    apart = -known.depths(motion)[:, 0]
+    group = (Group("x", ("left_hand",), ("left_thigh",), ()),)
+    apart = -known_depths(average, group).depths(motion)
+    gap = np.array([[1.0], [apart[1, 0] - 0.02], [apart[2, 0] - 0.02]])
+    known, at, term = _contact(average, motion, group, np.full((3, 1), 1e3), gap, np.array([[1.0], [1.0], [0.0]]))
+    seen = motion[at.rows]
     joint = average.skeleton.joint("left_upper_arm")
-    term = SkinContact(skin, np.array([[1.0], [apart[1] - 0.02], [apart[2] - 0.02]]), np.array([[1.0], [1.0], [0.0]]))
-    rows = np.asarray(eqx.filter_jit(lambda t: t.residual(mf.forward_kinematics(motion.skeleton, motion)))(term))
-    # near enough; 2 cm too far, less half the rounded corner, in units of 1 cm; without weight
-    np.testing.assert_allclose(rows[:, 0], [0.0, 1.9, 0.0], atol=1e-6)
+    rows = np.asarray(eqx.filter_jit(lambda t: t.residual(mf.forward_kinematics(seen.skeleton, seen)))(term))
+    assert rows.shape == (len(at.rows), PROBES + 1) and not rows[:, :-1].any()
+    # near enough; 2 cm too far, less half the rounded corner, in units of 1 cm, by pseudo-Huber; without weight
+    wide = 2.0 * np.sqrt(2 * (np.sqrt(1 + (1.9 / 2.0) ** 2) - 1))
+    np.testing.assert_allclose(rows[:3, -1], [0.0, wide, 0.0], atol=1e-5)
+    assert not rows[3:].any()  # what fills the bucket
 
     @jax.jit
     def cost(x):
         return 0.5 * jnp.sum(
-            term.residual(mf.forward_kinematics(motion.skeleton, _turned(motion, joint, [0.6, 0, 0.8], x[0]))) ** 2
+            term.residual(mf.forward_kinematics(seen.skeleton, _turned(seen, joint, [0.6, 0, 0.8], x[0]))) ** 2
         )
 
     x = np.array([0.01])
     np.testing.assert_allclose(jax.grad(cost)(x), central_difference(cost, x), rtol=1e-4, atol=1e-6)
+
+
+def test_a_solve_sees_the_deepest_points_of_the_nearest_parts_and_no_others(sunk, average):
+    """What is computed for the meetings alone is what the fields say of all points in all frames."""
+    _, motion = sunk
+    motion, groups = motion[10:40], GROUPS[:8]
+    known = known_depths(average, groups)
+    depths, free = known.depths(motion), np.zeros((30, len(known.radius)))
+    known, at, term = _contact(average, motion, groups, free, free, free)
+    kin = mf.forward_kinematics(motion.skeleton, motion[at.rows])
+    seen = np.asarray(eqx.filter_jit(lambda t: t.point_depths(kin))(term))
+    frame, met = np.asarray(term.frame), np.asarray(term.met)
+    real = np.asarray(term.allowed) < 1.0
+    assert seen.shape == (len(frame), PROBES) and 0 < real.sum() < depths.size
+    expected = depths[frame[real], met[real]]
+    near = expected > -0.05  # farther away, other points are nearest than those that go deepest
+    assert near.sum() > 50
+    np.testing.assert_allclose(seen[real].max(axis=1)[near], expected[near], atol=2e-3)
+    out = np.ones(depths.shape, bool)
+    out[frame[real], met[real]] = False
+    assert depths[out].max() < 0.0 < depths.max()  # nothing that sinks in is left out
+    # and the rows of a frame are those of its own meetings
+    rows = np.asarray(eqx.filter_jit(lambda t: t.residual(kin))(term)).reshape(len(at.rows), MOST, PROBES + 1)
+    smooth = np.asarray(term.allowed)
+    for t in (15, 20):
+        mine = np.flatnonzero(real & (frame == t))
+        expected = np.asarray(hinge(jnp.asarray(seen[mine] - smooth[mine, None]), 0.002) / 0.01)
+        np.testing.assert_allclose(rows[t, : len(mine), :-1], expected, atol=1e-6)
+        assert not rows[t, len(mine) :].any()
+
+
+@pytest.mark.slow
+def test_a_calf_comes_out_of_the_trunk(average):
+    """The tables' own groups for the legs: the trunk straightens."""
+    walk = mf.onto(samples.walk(cycles=1)[:16], average.skeleton)
+    rotations = np.array(walk.rotations)
+    for role, angle in (("left_thigh", -2.2), ("left_calf", 1.4), ("chest", 0.7)):
+        joint = average.skeleton.joint(role)
+        own = Rotation.from_quat(rotations[:, joint], scalar_first=True)
+        rotations[:, joint] = (Rotation.from_rotvec([angle, 0.0, 0.0]) * own).as_quat(scalar_first=True)
+    bent = Motion(walk.skeleton, walk.root, rotations, walk.dt)
+    fit = mf.adapt.collisions(walk, average, _as_fit(bent, bent, average), reference=average, groups=GROUPS[8:])
+    told = fit.details["collisions"]["left_calf/torso"]
+    assert told["excess_before_m"] > 0.02 and told["excess_after_m"] < 0.5 * told["excess_before_m"]
+
+
+def test_between_two_fits_is_either_of_them_at_the_ends(average):
+    base = mf.onto(samples.walk(cycles=1)[:30], average.skeleton)
+    at = sampling(base, 2 / 60)
+    controls = turn_controls(base, at.whole, [Turn("arm_out", (("left_upper_arm", "forward", 1.0),))])
+    so_far = _as_fit(base, base, average)
+    whole = on_top(so_far, Correction(controls, (np.full(at.basis.count, 0.3),)), at)
+    share = np.repeat([0.0, 0.5, 1.0], 10)
+    some = between("half", so_far, whole, share)
+    angles = joint_angles(some.motion, base).max(axis=1)
+    np.testing.assert_allclose(angles, 0.3 * share, atol=1e-6)
+    np.testing.assert_allclose(some.correction.apply(some.base).rotations, some.motion.rotations, atol=1e-12)
+    bare = without_arms(whole)
+    np.testing.assert_allclose(bare.motion.rotations, base.rotations, atol=1e-12)
+    assert [c.name for c in bare.correction.controls] == [c.name for c in whole.correction.controls]
+
+
+def test_rounds_end_where_they_are_of_no_more_use():
+    attempt = object.__new__(Attempt)
+    attempt.done, attempt.rounds = False, 0
+    for shown, stale in (([], False), ([1.0, 0.5, 0.2], False), ([0.5, 0.49, 0.48, 0.47], True),
+                         ([0.5, 0.6, 0.7, 0.4], False), ([0.0, 0.0, 0.0, 0.0], True)):  # fmt: skip
+        attempt.shown = shown
+        assert attempt._stale() is stale
+    told = []
+    attempt.done, attempt.shown = True, []
+    attempt.go_on(ROUNDS, lambda: told.append(1))
+    assert told == []
+
+
+def test_by_default_hands_that_meet_nothing_cost_no_block(average):
+    assert not hands_meet(samples.walk(cycles=1), average)
+
+
+@pytest.mark.slow
+def test_a_golfer_s_hands_stay_together_on_a_heavier_body(shared_data):
+    body, average = (
+        mf.load_character(shared_data / f"characters/{name}.glb") for name in ("athletic_female", "avg_male")
+    )
+    clip = mf.load_motion(shared_data / "bvh/64_01_golf_swing_two_hands.bvh")
+    clip = clip[190:310]
+    told = []
+    fit = mf.adapt(clip, body, reference=average, progress=lambda name, done, total: told.append(name))
+    assert "collisions" in told
+    hands = (Pair("left_hand", "right_hand", ""),)
+    original, at = mf.onto(clip, average.skeleton), np.arange(0, clip.frame_count, 6)
+    touched = skin_gaps(average, original[at], hands)[:, 0] < 0.005
+    assert touched.sum() >= 5 and (skin_gaps(body, fit.motion[at], hands)[touched] <= 0.02).mean() >= 0.9
+    excess = skin_depths(body, fit.motion[at]).depth - skin_depths(average, original[at]).depth
+    assert (excess > 0.01).any(axis=1).mean() <= 0.02
 
 
 def test_multi_start_escapes_the_trap_of_figure_4_9():

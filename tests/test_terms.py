@@ -11,6 +11,8 @@ from motionfit import samples
 from motionfit._motion import rest_motion
 from motionfit.adapt import build_clearance
 from motionfit.adapt._clearance import row_depths
+from motionfit.adapt._groups import GROUPS, Meetings, known_depths
+from motionfit.adapt._sampling import sampling
 from motionfit.adapt._touches import KEPT
 from motionfit.shape.pairs import pairs_of
 from motionfit.splines import bspline_basis
@@ -61,6 +63,20 @@ def _terms(character, motion):
     yield "robust", mf.Robust(mf.terms.Effort(0.01), 2.0)
     yield "during", mf.During(mf.terms.Smoothness(5.0), np.linspace(0, 1, frames))
     yield "custom", mf.Custom(_level, 0.9)
+    for kind in ("contact", "deep"):
+        yield f"meetings-{kind}", _meetings(character, motion, kind)
+
+
+def _meetings(character, motion, kind):
+    """Both hands against the thighs and the head: within a hair of the depth that counts, or deeper and apart too."""
+    known, at = known_depths(character, GROUPS[1:8:2]), sampling(motion, 2 / 60)
+    at = at._replace(rows=np.arange(motion.frame_count))
+    depths, meetings = known.depths(motion), Meetings(known, at)
+    meetings.seen(known.probe_depths(motion), np.zeros(depths.shape), depths)
+    free = depths - 1e-4 * np.where(np.arange(depths.shape[1]) % 2 == 0, 1.0, -1.0)
+    gap = -free if kind == "contact" else -depths - 0.03
+    term = meetings.term(free, gap, np.full(depths.shape, 0.5))
+    return term if kind == "contact" else eqx.tree_at(lambda t: t.allowed, term, np.full(len(term.allowed), -0.05))
 
 
 def _level(kin, height):
@@ -78,6 +94,8 @@ NAMES += [
     "robust",
     "during",
     "custom",
+    "meetings-contact",
+    "meetings-deep",
 ]
 
 

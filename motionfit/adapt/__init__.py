@@ -5,10 +5,11 @@ import types
 
 from motionfit.adapt._balance import balance
 from motionfit.adapt._clearance import OBJECTIVES, build_clearance, volume_depths
-from motionfit.adapt._collisions import GROUPS, Group, Sphere, collisions
+from motionfit.adapt._collisions import collisions
 from motionfit.adapt._controls import Turn
 from motionfit.adapt._feet import footskate
 from motionfit.adapt._forearm import forearm, multi_start
+from motionfit.adapt._groups import GROUPS, Group, Sphere
 from motionfit.adapt._limbs import limbs
 from motionfit.adapt._limits import reference_depths
 from motionfit.adapt._many import adapt_many

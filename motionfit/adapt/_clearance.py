@@ -176,7 +176,7 @@ def _look(look, term: Term, motion: Motion):
 def all_rows(term: Term, motion: Motion) -> Float[np.ndarray, "frames rows"]:
     """Depth [m] of every row of a term in every frame; negative where there is a gap."""
     if isinstance(term, SkinClearance):
-        return _point_by_point(term, motion).max(axis=2).astype(float)
+        return point_by_point(term, motion).max(axis=2).astype(float)
     return over_time(row_depths, term, motion).astype(float)
 
 
@@ -186,7 +186,8 @@ def row_depths(term: Term, kin: Kinematics) -> Float[Array, "frames rows"]:
     return term.depth(kin)
 
 
-def _point_by_point(term: SkinClearance, motion: Motion) -> Float[np.ndarray, "frames sets points"]:
+def point_by_point(term: SkinClearance, motion: Motion) -> Float[np.ndarray, "frames sets points"]:
+    """Depth [m] of every probe in every frame."""
     return over_time(_point_depths, term, motion)
 
 
@@ -199,7 +200,7 @@ def _point_depths(term: SkinClearance, kin: Kinematics) -> Float[Array, "frames 
 
 def probe_depths(clearance: Clearance, motion: Motion) -> Float[np.ndarray, "frames sets points"] | None:
     """Depth [m] of every probe in every frame; None where an objective has no probes."""
-    return _point_by_point(clearance.term, motion) if isinstance(clearance.term, SkinClearance) else None
+    return point_by_point(clearance.term, motion) if isinstance(clearance.term, SkinClearance) else None
 
 
 def volume_depths(

@@ -1,4 +1,4 @@
-"""General collisions, by groups that are data: thesis 4.6 and the arguments of appendix E's `removeCollision`.
+"""General collisions, by groups that are data: thesis 4.6.
 
 The arm and leg blocks take out what a shape makes of a motion. What is left comes from the movement itself, for a
 moment: a hand at the head, on the other arm, across the belly. And where a hand touches on purpose, it goes on touching.
@@ -11,26 +11,25 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
+from scipy.spatial.transform import Rotation
 
-from motionfit._character import PARTS, Character
+from motionfit._character import Character
 from motionfit._control import Correction
 from motionfit._fit import Fit, fit
-from motionfit._motion import Motion, bind_pose, joint_angles
+from motionfit._motion import Motion, joint_angles
 from motionfit._onto import onto
-from motionfit._problem import During, Problem, Robust
+from motionfit._problem import During, Problem
 from motionfit._skeleton import SIDES
 from motionfit._solve import Block
-from motionfit._types import InputError
-from motionfit.adapt._clearance import Clearance, all_rows, counted_probes, kept_with, probe_depths, reduced, support
+from motionfit.adapt._clearance import all_rows, build_clearance
 from motionfit.adapt._controls import Turn, turn_controls
-from motionfit.adapt._limbs import jerk_scale, smooth_floor
+from motionfit.adapt._groups import GROUPS, Group, Known, Meetings, known_depths
+from motionfit.adapt._limbs import jerk_scale
 from motionfit.adapt._limits import NEARLY, SkinLooks
 from motionfit.adapt._record import put_down
 from motionfit.adapt._sampling import Sampling, sampling
 from motionfit.metrics import TOLERANCE, derivative_ratio, skin_gaps
-from motionfit.shape.field import Probes, fit_field
 from motionfit.shape.pairs import PAIRS, Pair
-from motionfit.terms.penetration import SkinClearance, SkinContact
 from motionfit.terms.pose import Effort, Smoothness
 
 ALLOWED_EXCESS = 0.004  # [m] that may stay where more was
@@ -40,94 +39,24 @@ TOUCH_AIM = 0.012  # [m] a touch is brought back to
 HELD = 0.016  # [m] a solve is content with: where an arm then sinks in, a touch gives way a little
 NEAR, EVERY = 0.06, 3  # [m] by the fields: where the skin is asked, in each third frame that is seen
 EASE = 0.08  # [s] within which a touch is taken up and let go
+YIELDS = 0.2  # [s] around what sinks in, in which a correction gives way
 EFFORT = 1.0  # [rad]
 MOST_JERK = 1.04
 ROUNDS, PATIENCE = 12, 3  # rounds at most, and without a better result
+BETTER = 0.9  # of the best result so far, at most
+TRIAL, WELL = 2, 0.05  # rounds after which two starts are compared, and the faults below which there is no need to
 CLOSER = (0, 1, 2)  # rounds after which more frames are looked at
 GIVES = (0.1, 0.2, 0.3, *(0.5,) * 5)  # of what sinks in, one after the other: a touch bears little of it
 STIFFER = 4.0  # weight of what the skin shows, against the touches that pull the other way
-PROBES = {"upper_arm": 20, "forearm": 16, "hand": 16}
-
-
-class Sphere(NamedTuple):
-    """A ball that must stay empty of other parts: at a joint's role, or at a skin `vertex` that moves with it.
-
-    `offset` [m] is added in the bind pose, y up and z ahead; `radius` [m].
-    """
-
-    role: str
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    radius: float = 0.0
-    vertex: int | None = None
-
-    def place_bind(self, character: Character) -> Float[np.ndarray, "3"]:
-        joint = character.skeleton.joint(self.role)
-        if self.vertex is None:
-            start = bind_pose(character.skeleton)[0][joint]
-        else:
-            start = np.asarray(character.skin.vertices_bind, float)[self.vertex]
-        return start + np.asarray(self.offset)
-
-
-class Group(NamedTuple):
-    """What collides with what, and what may turn to avoid it.
-
-    `probes` are parts, whose skin is looked at, or spheres; `avoid` are parts. `turns` are the controls, each of which
-    may drive several joints by the same amount or its inverse. A knot every `spacing` frames that the solver sees (60
-    per second). Groups with the same turns and spacing are solved together, so that none undoes the other.
-    """
-
-    name: str
-    probes: tuple[str | Sphere, ...]
-    avoid: tuple[str, ...]
-    turns: tuple[Turn, ...]
-    spacing: int = 2
-
-
-def arm_turns(side: str) -> tuple[Turn, ...]:
-    """Shoulder about all axes, elbow about its two useful ones."""
-    arm, elbow = f"{side}_upper_arm", f"{side}_forearm"
-    return (*(Turn(f"{arm}_{axis}", ((arm, axis, 1.0),), 1.0) for axis in ("left", "up", "forward")),
-            Turn(f"{elbow}_bend", ((elbow, "bend", 1.0),), 1.0),
-            Turn(f"{elbow}_swing", ((elbow, "swing", 1.0),), 0.35))  # fmt: skip
-
-
-def _hands(side: str, other: str) -> tuple[Group, ...]:
-    arm, hand = (f"{side}_forearm", f"{side}_hand"), f"{side}_hand"
-    turns = (*arm_turns("left"), *arm_turns("right"))  # of both arms: each may touch the other
-    return (
-        Group(f"{hand}/torso", (f"{side}_upper_arm", *arm), ("torso",), turns),
-        Group(f"{hand}/head", arm, ("head",), turns),
-        Group(f"{hand}/shoulder", arm, (f"{other}_upper_arm", f"{other}_forearm", f"{other}_hand"), turns),
-        Group(f"{hand}/legs", arm, tuple(f"{s}_thigh" for s in SIDES), turns),
-    )
-
-
-def _bent(side: str) -> Group:
-    """The trunk straightens for a leg drawn up: it leaves the feet where they are."""
-    turns = tuple(Turn(f"trunk_{axis}", (("chest", axis, 1.0),), np.pi / 8) for axis in ("left", "forward"))
-    return Group(f"{side}_leg/torso", (f"{side}_calf",), ("torso",), turns)
-
-
-GROUPS: tuple[Group, ...] = (*_hands("left", "right"), *_hands("right", "left"), *(_bent(s) for s in SIDES))
-"""The five tables of the thesis, per side: legs/torso, hands/torso, hands/head, hands/shoulders, hands/legs."""
-
-
-class Known(NamedTuple):
-    """The clearance of some groups on a body, the radius [m] of each row, and which rows are those of a part's skin."""
-
-    clearance: Clearance
-    radius: Float[np.ndarray, " rows"]
-    on_skin: Bool[np.ndarray, " rows"]
-
-    def depths(self, motion: Motion) -> Float[np.ndarray, "frames rows"]:
-        """Depth [m] of each row in each frame; negative where there is a gap."""
-        return all_rows(self.clearance.term, motion) + self.radius
+WITHIN = 0.98  # of a control's bounds: where the points of a round begin
+ARM = ("clavicle", "upper_arm", "forearm", "hand")
+MEANT = tuple(Pair(f"{side}_hand", part, "arms") for side, other in (SIDES, SIDES[::-1])
+              for part in ("head", f"{other}_upper_arm", f"{other}_forearm", f"{other}_hand"))  # fmt: skip
 
 
 def collisions(
     clip: Motion, character: Character, so_far: Fit, *, reference: Character | None = None,
-    groups: Sequence[Group] = GROUPS,
+    groups: Sequence[Group] = GROUPS, progress: Callable[[int, int], None] | None = None,
 ) -> Fit:  # fmt: skip
     """Take the groups' probes out of what they shall avoid, as far as they are deeper in than on `reference`.
 
@@ -135,12 +64,22 @@ def collisions(
     as far as nothing sinks in for it. Without a reference, what the character shows with the clip before any correction
     may stay and touches, by the fields. What the arm and leg blocks reached is not undone: their pairs are in the
     tables, and with a reference what their skins show more becomes rows of the solve, as in `motionfit.adapt.limbs`.
-    `details["collisions"]` holds per pair the greatest excess [m] before and after, and the share of the touched frames
+    Where touches were lost, and two rounds do not bring them back, arms without any correction are another start: from
+    where the arm block led them, to either side of a heavy trunk, hands may not find together again.
+
+    `progress(done, most)` is called after each round. `details["collisions"]` holds per pair the greatest excess [m] before and after, and the share of the touched frames
     that still touch.
     """
-    result, told = so_far, {}
-    for some in _together(groups):
-        result, more = _solve(clip, character, result, reference, some)
+    result, told, together, done = so_far, {}, _together(groups), 0
+
+    def tell() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(min(done, len(together) * ROUNDS), len(together) * ROUNDS)
+
+    for some in together:
+        result, more = _solve(clip, character, result, reference, some, tell)
         told |= more
     return dataclasses.replace(result, details={**so_far.details, "collisions": told})
 
@@ -152,117 +91,179 @@ def _together(groups: Sequence[Group]) -> list[list[Group]]:
     return list(found.values())
 
 
-def known_depths(character: Character, groups: Sequence[Group]) -> Known:
-    pairs, probes, sets, set_of, parts, radius, on_skin = [], [], [], [], [], [], []
-    for group in groups:
-        for part in (p for p in (*group.avoid, *(q for q in group.probes if isinstance(q, str))) if p not in PARTS):
-            raise InputError(f"group {group.name!r} names unknown part {part!r}; parts: {', '.join(PARTS)}")
-        for probe in group.probes:
-            for avoid in group.avoid:
-                name = probe if isinstance(probe, str) else probe.role
-                side = name.partition("_")[0] if name.startswith(SIDES) and avoid == "torso" else "left"
-                # each hand is a set of its own: a touch by the other is no touch
-                key = (avoid, side, name if name.endswith("hand") else name.partition("_")[0])
-                if key not in sets:
-                    sets.append(key)
-                set_of.append(sets.index(key))
-                pairs.append(Pair(name, avoid, group.name))
-                parts.append(name)
-                radius.append(0.0 if isinstance(probe, str) else probe.radius)
-                on_skin.append(isinstance(probe, str))
-                probes.append(kept_with(character, counted_probes, probe, avoid) if isinstance(probe, str)
-                              else _at_sphere(character, probe))  # fmt: skip
-    term = SkinClearance(tuple(probes), tuple(kept_with(character, fit_field, *key[:2]) for key in sets), tuple(set_of),
-                         (np.zeros((1, 1)),) * len(probes))  # fmt: skip
-    return Known(Clearance(term, tuple(pairs), tuple(range(len(pairs))), tuple(parts)), np.array(radius),
-                 np.array(on_skin))  # fmt: skip
+class Asked(NamedTuple):
+    """What is asked of a solve, per frame that it sees and row of `known`."""
 
+    character: Character
+    so_far: Fit
+    small: Motion  # its motion, in those frames
+    at: Sampling
+    known: Known
+    turns: tuple[Turn, ...]
+    own: Float[np.ndarray, "frames rows"]  # [m] of depth on the reference
+    allowed: Float[np.ndarray, "frames rows"]  # [m] of depth that a solve starts with
+    most: Float[np.ndarray, "frames rows"]  # [m] of depth that a result may show
+    touching: Bool[np.ndarray, "frames rows"]
+    by_skin: bool
 
-def _at_sphere(character: Character, sphere: Sphere) -> Probes:
-    place = sphere.place_bind(character)
-    return Probes(np.array([character.skeleton.joint(sphere.role)]), np.append(place, 1.0)[None, :, None])
+    def gaps(self, of: Motion, depths: Float[np.ndarray, "frames rows"]) -> Float[np.ndarray, "frames rows"]:
+        """How far [m] what should touch is apart."""
+        if not self.by_skin:
+            return -depths
+        which = self.touching & self.known.on_skin
+        return skin_gaps_near(self.character, of, self.known.clearance.pairs, -depths, which)
 
 
 def _solve(
-    clip: Motion, character: Character, so_far: Fit, reference: Character | None, groups: list[Group]
-) -> tuple[Fit, dict]:
+    clip: Motion, character: Character, so_far: Fit, reference: Character | None, groups: list[Group],
+    tell: Callable[[], None],
+) -> tuple[Fit, dict]:  # fmt: skip
     motion, known = so_far.motion, known_depths(character, groups)
     at = sampling(motion, groups[0].spacing / 60.0)
-    small, count = at.motion(motion), len(at.frames)
-    pairs, looks = known.clearance.pairs, skin_looks(clip, character, reference, at)
+    small, pairs = at.motion(motion), known.clearance.pairs
+    looks = skin_looks(clip, character, reference, at)
     if reference is None:
         own, touching = _shown(known, at.motion(so_far.base), None)
     else:
         own, touching = _shown(known_depths(reference, groups), at.motion(onto(clip, reference.skeleton)), reference)
-    before = known.depths(small)
+    before, limit = known.depths(small), np.maximum(own, 0.0)
     # what meets at a joint goes no deeper than it is: on the skin, where that is looked at
-    inner, limit = np.array([p.adjacent for p in pairs]), np.maximum(own, 0.0)
+    inner = np.array([p.adjacent for p in pairs])
     most = np.where(inner, np.maximum(before, 0.0) + 0.001 if looks is None else np.inf, limit)
     allowed = np.where(inner, np.minimum(most, 1e3), limit + ALLOWED_EXCESS)
+    asked = Asked(character, so_far, small, at, known, groups[0].turns, own, allowed, np.maximum(most, limit), touching,
+                  looks is not None)  # fmt: skip
 
-    def gaps(of: Motion, depths: np.ndarray) -> np.ndarray:
-        return skin_gaps_near(character, of, pairs, -depths, touching & known.on_skin) if looks is not None else -depths
-
-    gap_before = gaps(small, before)
-    told = _told(pairs, before - limit, before - limit, gap_before, gap_before, touching)
+    gap_before = asked.gaps(small, before)
     apart, worst = np.where(touching, gap_before - TOUCH, 0.0), np.where(inner, 0.0, before - limit)
     if max(worst.max(initial=0.0) - TOLERANCE, apart.max(initial=0.0)) <= 0.0:
-        return so_far, told
-    # in the frames around a touch the hand is on its way
-    weight = gaussian_filter1d(maximum_filter1d(touching.astype(float), 3, axis=0), EASE / at.dt, axis=0)
-    gap, off = np.full(own.shape, TOUCH_AIM), np.where(touching, gap_before + before, 0.0)
-
-    controls = turn_controls(motion, at.whole, [t for t in groups[0].turns])
-    points = Correction.zero(tuple(at.control(c) for c in controls))
-    names, real = tuple(c.name for c in controls), np.arange(len(at.rows)) < count
-    score = support(known.clearance, probe_depths(known.clearance, small), limit)
-    seen = dataclasses.replace(motion[at.rows], dt=np.asarray(at.dt))
-    smooth, history, on_skin = jerk_scale(motion), [], np.zeros((1, 1))
-    tries = [(_faults(worst, apart, on_skin), so_far, before, points)]
-    for round_ in range(ROUNDS):
-        # what the fields are off by at a touch is taken off the wish
-        clear, touch = _clear_and_touch(known, at, score, allowed, gap - off, weight)
-        terms = {"collisions": clear, "touch": touch, "effort": During(Effort(EFFORT), real.astype(float)),
-                 "smoothness": During(Smoothness(smooth), (np.arange(len(at.rows)) < count - 2).astype(float))}  # fmt: skip
-        if looks is not None:
-            terms["skin"] = looks.touch_term(np.arange(len(PAIRS)), ALLOWED_EXCESS, len(at.rows))
-        problem = Problem(character, seen, terms, points.controls, {"skin": STIFFER} if looks is not None else None)
-        solved = fit(problem, (Block("collisions", names, max_steps=24, tolerance=1e-3),), correction=points)
-        points, history = solved.correction, [*history, *solved.history]
-        result = on_top(so_far, Correction(controls, points.points), at)
-        moved = at.motion(result.motion)
-        after = known.depths(moved)
-        gap_now = gaps(moved, after)
-        over, apart = after - np.maximum(most, limit), np.where(touching, gap_now - HELD, 0.0)
-        off = np.where(touching, gap_now + after, 0.0)
-        if looks is not None:
-            if round_ in CLOSER:
-                tries = tries[:1]  # what was looked at in fewer frames cannot be compared
-                looks.look_closer(joint_angles(moved, small).max(axis=1))
-                may = np.maximum(looks.depths(small) - looks.own, NEARLY * TOLERANCE)
-            on_skin = looks.depths_and_touches(moved) - looks.own - may
-        jerk = derivative_ratio(result.motion, motion, 3) or 1.0
-        if jerk <= MOST_JERK + 0.01:
-            tries.append((_faults(over, apart, on_skin), result, after, points))
-        done = max(over.max() - 0.7 * TOLERANCE, apart.max(), on_skin.max()) <= 0.0 and jerk <= MOST_JERK
-        stale = len(tries) - 1 - int(np.argmin([t[0] for t in tries]))
-        if done or stale >= PATIENCE:
-            break
-        if jerk > MOST_JERK:
-            smooth *= 0.5
-        allowed = allowed - np.where(over > 0.7 * TOLERANCE, np.minimum(over, 0.02), 0.0)
-        gap = gap - np.where(apart > 0.0, np.minimum(apart + 0.003, 0.02), 0.0)
-        score = np.maximum(score, support(known.clearance, probe_depths(known.clearance, moved), limit))
+        return so_far, _told(pairs, before - limit, before - limit, gap_before, gap_before, touching)
+    faults = _faults(worst, apart, np.zeros((1, 1)))
+    best = Attempt(asked, so_far, looks)
+    best.go_on(TRIAL, tell)
+    if not best.done and best.faults > WELL and (apart > 0.0).any():
+        # arms that were led out to either side of a trunk may not find together again from there
+        other = Attempt(asked, without_arms(so_far), None if looks is None else looks.anew())
+        other.go_on(TRIAL, tell)
+        best = min(best, other, key=lambda attempt: attempt.on_fields)
+    best.go_on(ROUNDS, tell)
     # a touch that cannot be had without sinking in elsewhere is given up, and so is all that makes matters worse
-    _, result, after, points = min(tries, key=lambda t: t[0])
-    if result is not so_far:
-        sunk = sinking_skin(looks, small, at)
-        result = eased(so_far, Correction(controls, points.points), at, groups[0].spacing / 60.0, sunk)
+    result, after = so_far, before
+    if best.result is not None and best.faults < faults:
+        result = eased("collisions_eased", so_far, best.result, at, sinking_skin(best.looks, small, at))
         after = known.depths(at.motion(result.motion))
-    told = _told(pairs, before - limit, after - limit, gap_before, gaps(at.motion(result.motion), after), touching)
+    gap_after = asked.gaps(at.motion(result.motion), after)
+    told = _told(pairs, before - limit, after - limit, gap_before, gap_after, touching)
     left = np.where(inner, 0.0, after - limit).max() > TOLERANCE
-    return dataclasses.replace(result, history=(*so_far.history, *history),
+    return dataclasses.replace(result, history=(*so_far.history, *best.history),
                                status="violations_left" if left else so_far.status), told  # fmt: skip
+
+
+class Attempt:
+    """Rounds of solves from one start: of what one of them leaves, the next is asked for more."""
+
+    def __init__(self, asked: Asked, start: Fit, looks: SkinLooks | None):
+        self.asked, self.start, self.looks = asked, start, looks
+        self.result: Fit | None = None  # the best so far
+        self.faults, self.shown = np.inf, []  # the least so far, and those of each round that can be compared
+        self.on_fields = np.inf  # those of the last round, but for what the skin shows: that takes more rounds to learn
+        self.done, self.rounds, self.history = False, 0, ()
+        motion, at, known = start.motion, asked.at, asked.known
+        self.seen = dataclasses.replace(motion[at.rows], dt=np.asarray(at.dt))
+        self.controls = turn_controls(motion, at.whole, asked.turns)
+        self.points = Correction.zero(tuple(at.control(c) for c in self.controls))
+        self.smooth = jerk_scale(motion)
+        # in the frames around a touch the hand is on its way
+        touching = maximum_filter1d(asked.touching.astype(float), 3, axis=0)
+        self.weight = gaussian_filter1d(touching, EASE / at.dt, axis=0)
+        probes = known.probe_depths(at.motion(motion))
+        depths = known.rows(probes)
+        self.meetings = Meetings(known, at)
+        self.meetings.seen(probes, np.maximum(asked.own, 0.0), np.maximum(depths, asked.own) - asked.allowed)
+        # what the fields are off by at a touch is taken off the wish
+        self.off = np.where(asked.touching, asked.gaps(at.motion(motion), depths) + depths, 0.0)
+        self.allowed, self.gap = asked.allowed, np.full(asked.own.shape, TOUCH_AIM)
+
+    def go_on(self, rounds: int, tell: Callable[[], None]) -> None:
+        """Up to that many rounds in all, as long as they are of use."""
+        while not self.done and self.rounds < rounds and not self._stale():
+            self._round()
+            tell()
+
+    def _stale(self) -> bool:
+        late, before = self.shown[-PATIENCE:], self.shown[:-PATIENCE]
+        return bool(before) and min(late) >= BETTER * min(before)
+
+    def _round(self) -> None:
+        asked, at, known = self.asked, self.asked.at, self.asked.known
+        result, history = self._solved()
+        self.history += history
+        moved = at.motion(result.motion)
+        probes = known.probe_depths(moved)
+        depths = known.rows(probes)
+        gap = asked.gaps(moved, depths)
+        over, apart = depths - asked.most, np.where(asked.touching, gap - HELD, 0.0)
+        self.off = np.where(asked.touching, gap + depths, 0.0)
+        on_skin = np.zeros((1, 1))
+        if self.looks is not None:
+            if self.rounds in CLOSER:
+                # what was looked at in fewer frames cannot be compared
+                self.result, self.faults, self.shown = None, np.inf, []
+                self.looks.look_closer(joint_angles(moved, asked.small).max(axis=1))
+            own = self.looks.own
+            may = np.maximum(self.looks.depths(asked.small) - own, NEARLY * TOLERANCE)
+            on_skin = self.looks.depths_and_touches(moved) - own - may
+        self.on_fields = _faults(over, apart, np.zeros((1, 1)))
+        rough = rougher(result, asked.so_far)
+        if rough <= 0.01:
+            self.shown.append(_faults(over, apart, on_skin))
+            if self.shown[-1] < self.faults:
+                self.faults, self.result = self.shown[-1], result
+        self.done = max(over.max() - 0.7 * TOLERANCE, apart.max(), on_skin.max(), rough) <= 0.0
+        if rough > 0.0:
+            self.smooth *= 0.5
+        self.allowed = self.allowed - np.where(over > 0.7 * TOLERANCE, np.minimum(over, 0.02), 0.0)
+        self.gap = self.gap - np.where(apart > 0.0, np.minimum(apart + 0.003, 0.02), 0.0)
+        self.meetings.seen(probes, np.maximum(asked.own, 0.0), depths - asked.allowed)
+        self.rounds += 1
+
+    def _solved(self) -> tuple[Fit, tuple]:
+        at = self.asked.at
+        rows = np.arange(len(at.rows))
+        terms = {"collisions": self.meetings.term(self.allowed, self.gap - self.off, self.weight),
+                 "effort": During(Effort(EFFORT), (rows < len(at.frames)).astype(float)),
+                 "smoothness": During(Smoothness(self.smooth), (rows < len(at.frames) - 2).astype(float))}  # fmt: skip
+        if self.looks is not None:
+            terms["skin"] = self.looks.touch_term(np.arange(len(PAIRS)), ALLOWED_EXCESS, len(at.rows))
+        weights = None if self.looks is None else {"skin": STIFFER}
+        problem = Problem(self.asked.character, self.seen, terms, self.points.controls, weights)
+        block = Block("collisions", tuple(c.name for c in self.controls), max_steps=24, tolerance=1e-3)
+        solved = fit(problem, (block,), correction=self.points)
+        # a point beyond its bound would stay there: no row changes with it
+        inside = (np.clip(np.asarray(p), WITHIN * float(c.lower), WITHIN * float(c.upper))
+                  for c, p in zip(self.controls, solved.correction.points, strict=True))  # fmt: skip
+        self.points = dataclasses.replace(solved.correction, points=tuple(inside))
+        return on_top(self.start, Correction(self.controls, self.points.points), at), solved.history
+
+
+def hands_meet(clip: Motion, body: Character) -> bool:
+    """Whether a hand of the clip touches the head, the other arm or the other hand on the body that it was made for."""
+    played = onto(clip, body.skeleton)
+    small = played[sampling(played).frames[::EVERY]]
+    near = all_rows(build_clearance(body, MEANT, "capsule").term, small) > -NEAR
+    gaps = skin_gaps(body, small, MEANT, near)
+    return bool((gaps[near] < TOUCHED).any())
+
+
+def without_arms(fit: Fit) -> Fit:
+    """The fit with its arms as they were before any correction."""
+    skeleton = fit.motion.skeleton
+    arms = {skeleton.find(f"{side}_{part}") for side in SIDES for part in ARM}
+    points = tuple(np.zeros_like(p) if arms.issuperset(int(d.joint) for d in c.drives) else p
+                   for c, p in zip(fit.correction.controls, fit.correction.points, strict=True))  # fmt: skip
+    bare = Correction(fit.correction.controls, points)
+    motion = dataclasses.replace(bare.apply(fit.base), source=fit.motion.source)
+    return dataclasses.replace(fit, correction=bare, motion=motion)
 
 
 def _shown(
@@ -275,20 +276,6 @@ def _shown(
     if body is None:
         return own, hands & (own > -TOUCH)
     return own, hands & (skin_gaps_near(body, motion, pairs, -own, known.on_skin) < TOUCHED)
-
-
-def _clear_and_touch(
-    known: Known, at: Sampling, score: Float[np.ndarray, "sets points"], allowed: Float[np.ndarray, "frames rows"],
-    gap: Float[np.ndarray, "frames rows"], weight: Float[np.ndarray, "frames rows"],
-) -> tuple[SkinClearance, Robust]:  # fmt: skip
-    """The rows that keep probes out, up to the depth [m] `allowed`, and those that keep a touch within a `gap` [m], as
-    far as the `weight` says: one of each per field."""
-    clear = reduced(known.clearance, score, filled(smooth_floor(allowed, at.dt) - known.radius, at, 1e3), PROBES)
-    field_of = np.array(known.clearance.term.field_of)  # pyright: ignore[reportAttributeAccessIssue]
-    by_set = [np.flatnonzero(field_of == k) for k in range(len(clear.fields))]
-    near = np.stack([weight[:, rows].max(axis=1) for rows in by_set], axis=1)
-    wish = np.stack([gap[:, rows].min(axis=1) for rows in by_set], axis=1)
-    return clear, Robust(SkinContact(clear, filled(wish, at, 1e3), filled(near, at, 0.0)))
 
 
 def skin_gaps_near(
@@ -326,24 +313,38 @@ def sinking_skin(looks: SkinLooks | None, small: Motion, at: Sampling) -> Callab
     return sunk
 
 
-def eased(
-    so_far: Fit, mine: Correction, at: Sampling, spacing: float, sunk: Callable[[Fit], Bool[np.ndarray, " seen"]]
-) -> Fit:
-    """A fit with more controls on top, of knots every `spacing` [s], and less and less of them around the frames that
-    show something `sunk`."""
-    share, width = np.ones(at.basis.count), EASE / spacing
+def eased(name: str, so_far: Fit, result: Fit, at: Sampling, sunk: Callable[[Fit], Bool[np.ndarray, " seen"]]) -> Fit:
+    """A result that becomes `so_far` again, as far as need be, around the frames that show something `sunk`."""
+    dt = float(so_far.motion.dt)
+    share, whole, width = np.ones(so_far.motion.frame_count), result, EASE / dt
     for gives in GIVES:
-        less = dataclasses.replace(mine, points=tuple(share * np.asarray(p)[: len(share)] for p in mine.points))
-        result = on_top(so_far, less, at)
         where = sunk(result)
-        jerk = derivative_ratio(result.motion, so_far.motion, 3) or 1.0
-        if not where.any() and jerk <= MOST_JERK + 0.01:
+        if not where.any() and rougher(result, so_far) <= 0.01:
             return result
-        around = np.zeros(at.basis.count)
-        around[np.asarray(at.basis.first)[np.flatnonzero(where)][:, None] + np.arange(4)] = 1.0
-        around = gaussian_filter1d(maximum_filter1d(around, 2 * round(2 * width) + 1), width)
+        around = np.zeros(len(share))
+        around[at.frames[where]] = 1.0
+        around = gaussian_filter1d(maximum_filter1d(around, 2 * round(YIELDS / dt) + 1), width)
         share = share * (1.0 - gives * around) if where.any() else (1.0 - gives) * share
+        result = between(name, so_far, whole, share)
     return so_far
+
+
+def rougher(fit: Fit, so_far: Fit) -> float:
+    """By how much the jerk of a fit, as a ratio to its base's, is more than it may be: that of `so_far` may stay."""
+    now, before = (derivative_ratio(f.motion, so_far.base, 3) or 1.0 for f in (fit, so_far))
+    return now - max(MOST_JERK, before)
+
+
+def between(name: str, so_far: Fit, result: Fit, share: Float[np.ndarray, " frames"]) -> Fit:
+    """A fit that is `so_far` where the share is 0, and the `result` where it is 1."""
+    before, after = (np.asarray(fit.motion.rotations, float) for fit in (so_far, result))
+    rotations, joints = after.copy(), np.flatnonzero((before != after).any(axis=(0, 2))).tolist()
+    for joint in joints:
+        first, last = (Rotation.from_quat(q[:, joint], scalar_first=True) for q in (before, after))
+        turned = Rotation.from_rotvec(share[:, None] * (last * first.inv()).as_rotvec()) * first
+        rotations[:, joint] = turned.as_quat(scalar_first=True)
+    motion = dataclasses.replace(result.motion, rotations=rotations)
+    return put_down(name, result, motion, result.base, result.correction, joints)
 
 
 def _faults(
@@ -364,10 +365,6 @@ def on_top(so_far: Fit, mine: Correction, at: Sampling) -> Fit:
     joints = sorted({int(d.joint) for c in mine.controls for d in c.drives})
     name = mine.controls[0].name
     return put_down(name, so_far, motion, base, both, joints)
-
-
-def filled(rows: np.ndarray, at: Sampling, value: float) -> np.ndarray:
-    return np.concatenate([rows, np.full((len(at.rows) - len(rows), rows.shape[1]), value)])
 
 
 def _told(pairs, excess_before, excess_after, gap_before, gap_after, touching) -> dict:

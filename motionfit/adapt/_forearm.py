@@ -18,11 +18,12 @@ from motionfit._programs import program
 from motionfit._skeleton import SIDES
 from motionfit._solve import Block, block_adjoint, block_solver, block_work, solve_block
 from motionfit.adapt._clearance import probe_depths, reduced, support
-from motionfit.adapt._collisions import Group, eased, filled, known_depths, on_top, sinking_skin, skin_looks
+from motionfit.adapt._collisions import eased, on_top, sinking_skin, skin_looks
 from motionfit.adapt._controls import Turn, turn_controls
+from motionfit.adapt._groups import Group, filled, known_depths
 from motionfit.adapt._limbs import SOLVE_PROBES, jerk_scale, smooth_floor
 from motionfit.adapt._record import put_down
-from motionfit.adapt._sampling import KNOT_SPACING, sampling
+from motionfit.adapt._sampling import sampling
 from motionfit.metrics import TOLERANCE, derivative_ratio
 from motionfit.terms.pose import Direction, Effort, Smoothness
 
@@ -124,7 +125,7 @@ def _side(clip: Motion, character: Character, so_far: Fit, reference: Character 
         after = clear.depths(at.motion(fit.motion))
         return (after - np.maximum(limit, before) > TOLERANCE).any(axis=1) | on_skin(fit)
 
-    result = eased(so_far, Correction(controls, points.points), at, KNOT_SPACING, sunk)
+    result = eased(f"{side}_forearm_eased", so_far, result, at, sunk)
     told["error_after_rad"] = error(result.motion)
     if told["error_after_rad"] > told["error_before_rad"]:
         result, told["error_after_rad"] = so_far, told["error_before_rad"]

@@ -78,6 +78,12 @@ class SkinLooks:
             known.update({poses[i]: depths for i, depths in zip(new, shown, strict=True)})
         return np.array([known[pose] for pose in poses]).reshape(len(at), len(self.pairs))
 
+    def anew(self) -> "SkinLooks":
+        """Looks that start over, but look at no pose twice."""
+        fresh = SkinLooks(self.clip, self.character, self.reference, self.pairs)
+        fresh.seen = self.seen
+        return fresh
+
     def depths(self, motion: Motion) -> Float[np.ndarray, "looks pairs"]:
         """Depth [m] per look and pair of a motion of the solver's frames."""
         return np.array([look.depths for look in self._look(motion, self.at).values()])

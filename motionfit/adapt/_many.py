@@ -20,7 +20,7 @@ from motionfit._fit import Fit
 from motionfit._motion import Motion
 from motionfit._traces import SETTINGS, keep_programs, programs_folder
 from motionfit.adapt._clearance import OBJECTIVES
-from motionfit.adapt._procedure import DEFAULT, adapt
+from motionfit.adapt._procedure import adapt
 
 AHEAD = 2  # bodies per worker that wait or are in work: results come in order, and no worker waits for another's
 One = Callable[[Character, Fit | None], Fit]
@@ -32,7 +32,7 @@ def adapt_many(
     bodies: Iterable[Character],
     *,
     reference: Character | None = None,
-    blocks: Sequence[str] = DEFAULT,
+    blocks: Sequence[str] | None = None,
     objective: str = OBJECTIVES[0],
     workers: int | None = None,
     progress: Callable[[int], None] | None = None,
@@ -49,7 +49,7 @@ def adapt_many(
     each other. `progress(done)` is called after each.
     """
     workers = min(workers or os.cpu_count() or 1, length_hint(bodies) or sys.maxsize)
-    one = functools.partial(_adapted, clip, reference, tuple(blocks), objective)
+    one = functools.partial(_adapted, clip, reference, None if blocks is None else tuple(blocks), objective)
     if workers == 1 or jax.default_backend() != "cpu":  # one accelerator is one worker
         return _in_turn(one, bodies, progress)
     return _at_once(one, bodies, workers, progress)
@@ -58,7 +58,7 @@ def adapt_many(
 def _adapted(
     clip: Motion,
     reference: Character | None,
-    blocks: tuple[str, ...],
+    blocks: tuple[str, ...] | None,
     objective: str,
     body: Character,
     start: Fit | None,

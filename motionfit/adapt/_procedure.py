@@ -13,7 +13,7 @@ from motionfit._problem import Problem
 from motionfit._programs import make_room
 from motionfit._types import InputError
 from motionfit.adapt._balance import balance
-from motionfit.adapt._collisions import collisions
+from motionfit.adapt._collisions import collisions, hands_meet
 from motionfit.adapt._feet import footskate
 from motionfit.adapt._forearm import forearm
 from motionfit.adapt._limbs import LIMBS, limbs
@@ -24,6 +24,7 @@ Progress = Callable[[str, int, int], None]
 LATER = {"forearm": forearm, "collisions": collisions, "footskate": footskate, "balance": balance}
 BLOCKS = (*LIMBS, *LATER)
 DEFAULT = ("arms", "legs", "footskate", "balance")  # the others cost more than they change on most clips
+HOLDING = ("arms", "legs", "collisions", "footskate", "balance")  # of a clip whose hands meet something
 
 
 def adapt(
@@ -32,7 +33,7 @@ def adapt(
     *,
     reference: Character | None = None,
     girth: Mapping[str, float] | None = None,
-    blocks: Sequence[str] = DEFAULT,
+    blocks: Sequence[str] | None = None,
     objective: str = "vertex",
     sweeps: int = 1,
     start: Fit | None = None,
@@ -45,7 +46,8 @@ def adapt(
     apart; `forearm` brings the forearms back to where they pointed; `collisions` takes hands out of head, other arm
     and legs, and keeps touches that were meant; `footskate` keeps the planted feet where they are, by the root alone
     (without other blocks, it also stops what drift the source has itself);
-    `balance` keeps the zero-moment point as near to the support as it was. Each has options of its own as
+    `balance` keeps the zero-moment point as near to the support as it was. Without `blocks`, `forearm` is left out, and
+    so is `collisions`, but where a hand touches the head, the other arm or hand. Each has options of its own as
     `motionfit.adapt.forearm` and so on, which go on from a `Fit`. Penetration counts as far as it exceeds what the same
     clip shows on `reference`, the body that it was made for; without one, on the character before `girth`, else in
     its rest pose. A clip that was adapted to the same character before (`Motion.source`) is judged by what its source
@@ -56,8 +58,8 @@ def adapt(
     The `Fit` holds the adapted motion, the correction, what each block did, and in `details` what the blocks
     measured: see `motionfit.adapt.limbs`.
     """
-    unknown = [b for b in blocks if b not in BLOCKS]
-    if unknown or not blocks:
+    unknown = [b for b in blocks or () if b not in BLOCKS]
+    if unknown or (blocks is not None and not blocks):
         raise InputError(f"unknown block {', '.join(map(repr, unknown)) or 'list'}; blocks: {', '.join(BLOCKS)}")
     if clip.frame_count == 0:
         raise InputError("the clip has no frames: it was cut to nothing; check its start and end")
@@ -68,6 +70,8 @@ def adapt(
     adapted = clip.source_on(body) is not clip
     source, clip = (dataclasses.replace(m, source=None) for m in (clip.source_on(body), clip))
     base = onto(clip, character.skeleton)
+    if blocks is None:
+        blocks = HOLDING if hands_meet(source, reference or character) else DEFAULT
     first, later = (tuple(b for b in some if b in blocks) for some in (LIMBS, LATER))
     parts = bool(first) + len(later)
 
@@ -81,8 +85,10 @@ def adapt(
     else:
         fit = Fit(Correction((), ()), base, base, "converged", (), Problem(character, base, {}, ()))
     # what the source drifts is its own, unless nothing else is asked for
-    options = {"footskate": {"drift": tuple(blocks) == ("footskate",)}}
+    options: dict[str, dict] = {"footskate": {"drift": tuple(blocks) == ("footskate",)}}
     for k, name in enumerate(later, start=bool(first)):
+        if name == "collisions":
+            options[name] = {"progress": functools.partial(told, k, name)}
         fit = LATER[name](source, character, fit, reference=reference, **options.get(name, {}))
         told(k, name, 1, 1)
     return dataclasses.replace(fit, motion=dataclasses.replace(fit.motion, source=Source(source, body)))

@@ -69,6 +69,22 @@ def depths(
 
     One program for all fields: what is compiled is the same for a trunk on four joints as for a thigh on one.
     """
+    moves = _moves_home(kin, fields)
+    meeting = _Meeting.of(fields, tuple(p.shape[-1] for p in points_world))
+    return _depth(meeting, tuple(moves[:, k] for k in range(len(fields))), tuple(points_world))
+
+
+def depths_met(
+    kin: Kinematics, fields: Sequence[DepthField], frame: Int[Array, " meetings"], met: Int[Array, " meetings"],
+    points_world: Float[Array, "meetings 3 points"],
+) -> Float[Array, "meetings points"]:  # fmt: skip
+    """Depth [m] of points, each row of them in a frame and below the skin of a field of its own."""
+    return _depth(_Meeting.of(fields, (1,) * len(fields)).of_each(met), (_moves_home(kin, fields)[frame, met],),
+                  (points_world,))  # fmt: skip
+
+
+def _moves_home(kin: Kinematics, fields: Sequence[DepthField]) -> Float[Array, "frames fields joints 3 4"]:
+    """What takes world points to each field's tabulated pose, with each of its joints."""
     longest = max(len(field.joints) for field in fields) - 2
 
     def filled(x):  # a shorter chain repeats its last joint, which changes nothing
@@ -82,22 +98,20 @@ def depths(
     turns = home_rotations @ jnp.swapaxes(rotation.to_matrix(kin.rotations_world[:, joints]), -1, -2)
     places = kin.positions_world[:, joints]
     shifts = home_positions - rotation.matrix_times(turns, places)
-    moves = jnp.concatenate([turns, shifts[..., None]], axis=-1)  # (frames, fields, joints, 3, 4)
-    meeting = _Meeting.of(fields, tuple(p.shape[-1] for p in points_world))
-    return _depth(meeting, tuple(moves[:, k] for k in range(len(fields))), tuple(points_world))
+    return jnp.concatenate([turns, shifts[..., None]], axis=-1)
 
 
 class _Meeting(eqx.Module):
-    """Points and the fields that they meet: for each point the numbers of its own field. `tables` are the depth and
-    the two pulls, the grids of all fields one after the other."""
+    """Points and the fields that they meet: for each point the numbers of its own field, the same in all frames or
+    others in each. `tables` are the depth and the two pulls, the grids of all fields one after the other."""
 
     tables: Float[Array, "3 nodes"]
-    start: Int[Array, " points"]
-    size: Int[Array, "3 points"]
-    origin: Float[Array, "3 points"]
-    spacing: Float[Array, "3 points"]
-    axis: Float[Array, "3 points"]
-    takeover: Float[Array, "joins 2 points"]
+    start: Int[Array, "*frames points"]
+    size: Int[Array, "*frames 3 points"]
+    origin: Float[Array, "*frames 3 points"]
+    spacing: Float[Array, "*frames 3 points"]
+    axis: Float[Array, "*frames 3 points"]
+    takeover: Float[Array, "*frames joins 2 points"]
 
     @classmethod
     def of(cls, fields: Sequence[DepthField], counts: Sequence[int]) -> "_Meeting":
@@ -120,6 +134,11 @@ class _Meeting(eqx.Module):
                    spread([f.origin for f in fields]), spread([f.spacing for f in fields]),
                    spread([f.axis_home for f in fields]), spread(takeover))  # fmt: skip
 
+    def of_each(self, which: Int[Array, " frames"]) -> "_Meeting":
+        """All points of a frame meet one of the fields, of which there is one point each here."""
+        numbers = self.start, self.size, self.origin, self.spacing, self.axis, self.takeover
+        return _Meeting(self.tables, *(jnp.moveaxis(x, -1, 0)[which, ..., None] for x in numbers))
+
     def cells(self, points_home: Float[Array, "*frames 3 points"]) -> tuple[Array, Array]:
         """Grid coordinates clipped to the grid, and the distance [m] to it, which counts as a gap."""
         cells = (points_home - self.origin) / self.spacing
@@ -136,9 +155,10 @@ class _Meeting(eqx.Module):
     ) -> Float[Array, "frames 3 points"]:  # fmt: skip
         """Points in the tabulated pose, from where the chain's joints and the two that pull alone would take them."""
         home = chain[:, 0]
-        if len(self.takeover):
+        if self.takeover.shape[-3]:
             height = _over_coordinates(self.axis * jnp.mean(chain, axis=1))
-            taken = _smoothstep((height[:, None] - self.takeover[:, 0]) / (self.takeover[:, 1] - self.takeover[:, 0]))
+            low, high = self.takeover[..., 0, :], self.takeover[..., 1, :]
+            taken = _smoothstep((height[:, None] - low) / (high - low))
             ones = jnp.ones_like(taken[:, :1])
             shares = jnp.concatenate([ones, taken], axis=1) - jnp.concatenate([taken, 0 * ones], axis=1)
             home = jnp.sum(shares[:, :, None] * chain, axis=1)
@@ -215,7 +235,7 @@ def _neighbours(size, start, cells):
     """Offsets of grid coordinates from their nearest node, and the index of the first of the 27 neighbours."""
     nodes = jnp.round(cells)
     i, j, k = (nodes[..., a, :].astype(jnp.int32) - 1 for a in range(3))
-    return cells - nodes, start + (i * size[1] + j) * size[2] + k
+    return cells - nodes, start + (i * size[..., 1, :] + j) * size[..., 2, :] + k
 
 
 def _weights(offsets) -> Array:
@@ -228,7 +248,7 @@ def _slopes(offsets) -> Array:
 
 def _along(tables, size, base, at):
     """The three neighbours along z in column (a, b): (3, tables, points...)."""
-    place = base + (at[0] * size[1] + at[1]) * size[2]
+    place = base + (at[0] * size[..., 1, :] + at[1]) * size[..., 2, :]
     return [tables.at[:, place + c].get(mode="promise_in_bounds") for c in range(3)]
 
 
@@ -442,6 +462,30 @@ class Probes(eqx.Module):
             blend[[joints.index(j) for j in p.joints.tolist()], :, start:stop] = p.blend
             start = stop
         return cls(np.array(joints), blend)
+
+
+class ProbeSets(eqx.Module):
+    """Sets of as many probes each; `joints` and `blend` are those of `Probes`, set after set."""
+
+    joints: Int[AnyArray, "sets carrying"]
+    blend: Float[AnyArray, "sets carrying 4 points"]
+
+    @classmethod
+    def of(cls, some: Sequence[Probes]) -> "ProbeSets":
+        """A set on fewer joints repeats its last one, which moves nothing."""
+        most = max(len(p.joints) for p in some)
+        short = [most - len(p.joints) for p in some]
+        joints = [np.pad(p.joints, (0, n), "edge") for p, n in zip(some, short, strict=True)]
+        return cls(np.stack(joints), np.stack([np.pad(p.blend, ((0, n), (0, 0), (0, 0))) for p, n in
+                                               zip(some, short, strict=True)]))  # fmt: skip
+
+    def positions_world(
+        self, kin: Kinematics, frame: Int[Array, " meetings"], met: Int[Array, " meetings"]
+    ) -> Float[Array, "meetings 3 points"]:
+        """World positions [m] of some sets, each in a frame of its own."""
+        turns, shifts = kin.skin_transforms()
+        moves = jnp.concatenate([turns, shifts[..., None]], axis=-1)[frame[:, None], jnp.asarray(self.joints)[met]]
+        return jnp.einsum("tcab,tcbp->tap", moves, jnp.asarray(self.blend, moves.dtype)[met])
 
 
 def sample_vertices(

@@ -12,10 +12,10 @@ from jaxtyping import Float, Int
 
 from motionfit import rotation
 from motionfit._motion import Kinematics
-from motionfit._problem import Term
+from motionfit._problem import Term, pseudo_huber
 from motionfit._types import AnyArray
 from motionfit.shape.distance import capsule_depth, cylinder_depth
-from motionfit.shape.field import DepthField, Probes, depths
+from motionfit.shape.field import DepthField, Probes, ProbeSets, depths, depths_met
 from motionfit.shape.volumes import Volumes
 
 
@@ -155,18 +155,40 @@ class TouchClearance(Term):
 
 
 class SkinContact(Term):
-    """Parts that touch go on touching: the deepest point of a set no farther from the other part's skin than `gap` [m].
+    """Points of parts' skin against the fields that they come near, which are others in each frame: not too deep in
+    and, where they touch on purpose, not too far away.
 
-    The counterpart of `SkinClearance`, whose probes and fields it has. `gap` is per frame and set, and `weight` (0..1)
-    says in which frames there is a touch to keep: an intended contact, such as a hand on the hip. `sigma` [m].
+    Each set of probes is tested against one of the `fields`, that of its number in `field_of`. A meeting is a set and a
+    frame; there is nothing to compute where parts are far from each other. `meeting_of` says which meetings are the rows
+    of a frame, and has numbers past the last one where there are fewer. Per meeting, `allowed` [m] is the depth that
+    does not count, and `gap` [m] is how far the deepest point may be from the other part's skin, as far as the `weight`
+    (0..1) says that there is a touch to keep, such as a hand on the hip. Beyond `c` times `sigma` [m] a lost touch pulls
+    no harder: pseudo-Huber.
     """
 
-    skin: SkinClearance
-    gap: Float[AnyArray, "frames sets"]
-    weight: Float[AnyArray, "frames sets"]
+    probes: ProbeSets
+    fields: tuple[DepthField, ...]
+    field_of: Int[AnyArray, " sets"]
+    frame: Int[AnyArray, " meetings"]
+    met: Int[AnyArray, " meetings"]
+    meeting_of: Int[AnyArray, "frames some"]
+    allowed: Float[AnyArray, " meetings"]
+    gap: Float[AnyArray, " meetings"]
+    weight: Float[AnyArray, " meetings"]
     sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.01)
     width: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.002)
+    c: Float[AnyArray, ""] = eqx.field(converter=_array, default=2.0)
 
-    def residual(self, kin: Kinematics) -> Float[Array, "frames sets"]:
-        apart = -self.skin.depth(kin) - jnp.asarray(self.gap)
-        return jnp.asarray(self.weight) * hinge(apart, self.width) / self.sigma
+    def point_depths(self, kin: Kinematics) -> Float[Array, "meetings points"]:
+        """Depth [m] of every point of the sets that meet something; negative outside."""
+        frame, met = jnp.asarray(self.frame), jnp.asarray(self.met)
+        return depths_met(kin, self.fields, frame, jnp.asarray(self.field_of)[met],
+                          self.probes.positions_world(kin, frame, met))  # fmt: skip
+
+    def residual(self, kin: Kinematics) -> Float[Array, "frames rows"]:
+        depth = self.point_depths(kin)
+        deep = hinge(depth - jnp.asarray(self.allowed)[:, None], self.width) / self.sigma
+        apart = hinge(-jnp.max(depth, axis=1) - jnp.asarray(self.gap), self.width) / self.sigma
+        lost = pseudo_huber(jnp.asarray(self.weight) * apart, jnp.asarray(self.c))
+        rows = jnp.pad(jnp.concatenate([deep, lost[:, None]], axis=1), ((0, 1), (0, 0)))
+        return rows[jnp.asarray(self.meeting_of)].reshape(len(self.meeting_of), -1)
