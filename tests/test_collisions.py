@@ -20,6 +20,7 @@ from motionfit.adapt import Group, Sphere, Turn, multi_start
 from motionfit.adapt._collisions import (
     ROUNDS,
     Attempt,
+    _windows,
     between,
     eased,
     hands_meet,
@@ -45,12 +46,12 @@ def _as_fit(motion, base, character):
     return mf.Fit(Correction((), ()), motion, base, "converged", (), mf.Problem(character, base, {}, ()))
 
 
-@pytest.fixture(scope="module")
-def sunk(average):
-    """The walk, and the walk with the left hand swung into the thigh for a moment."""
-    base = mf.onto(samples.walk(cycles=1), average.skeleton)
+def _swung_in(average, cycles, moments):
+    """The walk, and the walk with the left hand swung into the thigh around some frames."""
+    base = mf.onto(samples.walk(cycles=cycles), average.skeleton)
     joint = average.skeleton.joint("left_upper_arm")
-    swing = 0.35 * np.exp(-(((np.arange(base.frame_count) - 25) / 8.0) ** 2))
+    time = np.arange(base.frame_count)
+    swing = 0.35 * sum(np.exp(-(((time - moment) / 8.0) ** 2)) for moment in moments)
     world = host_kinematics(base)[1][:, average.skeleton.parents[joint]]
     # about the forward axis, so that the hanging arm goes to the right
     axis = Rotation.from_quat(world, scalar_first=True).inv().apply([0.0, 0.0, -1.0])
@@ -58,6 +59,40 @@ def sunk(average):
     own = Rotation.from_quat(rotations[:, joint], scalar_first=True)
     rotations[:, joint] = (Rotation.from_rotvec(swing[:, None] * axis) * own).as_quat(scalar_first=True)
     return base, Motion(base.skeleton, base.root, rotations, base.dt)
+
+
+@pytest.fixture(scope="module")
+def sunk(average):
+    return _swung_in(average, 1, (25,))
+
+
+@pytest.mark.slow
+def test_of_a_long_clip_only_what_is_wrong_is_solved(average):
+    first = 60
+    second = first + 4 * (samples.walk(cycles=6).frame_count // 6)  # the same moment of a later step
+    base, bad = _swung_in(average, 6, (first, second))
+    group = Group("hand/thigh", ("left_hand",), ("left_thigh",),
+                  (Turn("arm_out", (("left_upper_arm", "forward", 1.0),)),
+                   Turn("arm_ahead", (("left_upper_arm", "left", 1.0),))))  # fmt: skip
+    shares = []
+    fit = mf.adapt.collisions(base, average, _as_fit(bad, base, average), groups=(group,),
+                              progress=lambda done, most: shares.append(done / most))  # fmt: skip
+    told = fit.details["collisions"]["left_hand/left_thigh"]
+    assert told["excess_before_m"] > 0.02 and told["excess_after_m"] < 0.01
+    assert shares == sorted(shares) and 0.0 < shares[0] and shares[-1] <= 1.0
+    moved = joint_angles(fit.motion, bad).max(axis=1)
+    assert moved[[first, second]].min() > 0.05
+    between = (first + second) // 2
+    np.testing.assert_array_equal(fit.motion.rotations[between], bad.rotations[between])
+    np.testing.assert_allclose(fit.correction.apply(fit.base).rotations, fit.motion.rotations, atol=1e-12)
+    assert (mf.metrics.derivative_ratio(fit.motion, bad, 3) or 9.0) < 1.1
+
+
+def test_windows_are_the_runs_of_what_is_wrong_and_what_is_beside_it():
+    wrong = np.zeros(100, bool)
+    wrong[[20, 24, 70, 99]] = True
+    assert _windows(wrong, 10) == [slice(9, 35), slice(60, 81), slice(87, 100)]
+    assert _windows(np.zeros(5, bool), 10) == [] and _windows(np.ones(5, bool), 10) == [slice(0, 5)]
 
 
 @pytest.mark.slow
@@ -85,7 +120,7 @@ def test_what_sinks_in_on_the_skin_gives_way_there_and_nowhere_else(average):
     time = np.arange(at.basis.count) / (at.whole.count - 1)
     in_then_out = 0.3 * (np.exp(-(((time - 0.75) / 0.1) ** 2)) - np.exp(-(((time - 0.25) / 0.1) ** 2)))
     mine, so_far = Correction(controls, (in_then_out,)), _as_fit(base, base, average)
-    whole, looks, small = on_top(so_far, mine, at), skin_looks(base, average, average, at), at.motion(base)
+    whole, looks, small = on_top(so_far, mine, at), skin_looks(base[at.frames], average, average), at.motion(base)
     assert looks is not None
     looks.look_closer(joint_angles(at.motion(whole.motion), small).max(axis=1))
     result = eased("eased", so_far, whole, at, sinking_skin(looks, small, at))

@@ -48,6 +48,8 @@ TRIAL, WELL = 2, 0.05  # rounds after which two starts are compared, and the fau
 CLOSER = (0, 1, 2)  # rounds after which more frames are looked at
 GIVES = (0.1, 0.2, 0.3, *(0.5,) * 5)  # of what sinks in, one after the other: a touch bears little of it
 STIFFER = 4.0  # weight of what the skin shows, against the touches that pull the other way
+BESIDE, TAKEN_UP = 0.6, 0.3  # [s] around what is wrong: what is solved, and of it what a correction is taken up in
+MUCH = 0.7  # of a clip, from which on it is solved as a whole
 WITHIN = 0.98  # of a control's bounds: where the points of a round begin
 ARM = ("clavicle", "upper_arm", "forearm", "hand")
 MEANT = tuple(Pair(f"{side}_hand", part, "arms") for side, other in (SIDES, SIDES[::-1])
@@ -67,18 +69,18 @@ def collisions(
     Where touches were lost, and two rounds do not bring them back, arms without any correction are another start: from
     where the arm block led them, to either side of a heavy trunk, hands may not find together again.
 
-    `progress(done, most)` is called after each round. `details["collisions"]` holds per pair the greatest excess [m] before and after, and the share of the touched frames
-    that still touch.
+    Only the frames around what is wrong are solved, run by run, unless they are most of the clip.
+
+    `progress(done, most)` is called after each round. `details["collisions"]` holds per pair the greatest excess [m]
+    before and after, and the share of the touched frames that still touch.
     """
-    result, told, together, done = so_far, {}, _together(groups), 0
+    result, told, together = so_far, {}, _together(groups)
+    for k, some in enumerate(together):
 
-    def tell() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(min(done, len(together) * ROUNDS), len(together) * ROUNDS)
+        def tell(share: float, k: int = k) -> None:
+            if progress is not None:
+                progress(round(100 * (k + share) / len(together)), 100)
 
-    for some in together:
         result, more = _solve(clip, character, result, reference, some, tell)
         told |= more
     return dataclasses.replace(result, details={**so_far.details, "collisions": told})
@@ -96,7 +98,6 @@ class Asked(NamedTuple):
 
     character: Character
     so_far: Fit
-    small: Motion  # its motion, in those frames
     at: Sampling
     known: Known
     turns: tuple[Turn, ...]
@@ -106,6 +107,11 @@ class Asked(NamedTuple):
     touching: Bool[np.ndarray, "frames rows"]
     by_skin: bool
 
+    @property
+    def small(self) -> Motion:
+        """The motion so far, in the frames that are seen."""
+        return self.at.motion(self.so_far.motion)
+
     def gaps(self, of: Motion, depths: Float[np.ndarray, "frames rows"]) -> Float[np.ndarray, "frames rows"]:
         """How far [m] what should touch is apart."""
         if not self.by_skin:
@@ -113,15 +119,22 @@ class Asked(NamedTuple):
         which = self.touching & self.known.on_skin
         return skin_gaps_near(self.character, of, self.known.clearance.pairs, -depths, which)
 
+    def part(self, seen: slice, spacing: float, least: int) -> "Asked":
+        """What is asked in some of the frames that are seen, up to the next one after them."""
+        ends = np.append(self.at.frames, self.so_far.motion.frame_count)
+        so_far = cut(self.so_far, np.arange(int(ends[seen.start]), int(ends[seen.stop])))
+        own, allowed, most, touching = (x[seen] for x in (self.own, self.allowed, self.most, self.touching))
+        return self._replace(so_far=so_far, at=sampling(so_far.motion, spacing, least=least), own=own, allowed=allowed,
+                             most=most, touching=touching)  # fmt: skip
+
 
 def _solve(
     clip: Motion, character: Character, so_far: Fit, reference: Character | None, groups: list[Group],
-    tell: Callable[[], None],
+    tell: Callable[[float], None],
 ) -> tuple[Fit, dict]:  # fmt: skip
-    motion, known = so_far.motion, known_depths(character, groups)
-    at = sampling(motion, groups[0].spacing / 60.0)
+    motion, known, spacing = so_far.motion, known_depths(character, groups), groups[0].spacing / 60.0
+    at = sampling(motion, spacing)
     small, pairs = at.motion(motion), known.clearance.pairs
-    looks = skin_looks(clip, character, reference, at)
     if reference is None:
         own, touching = _shown(known, at.motion(so_far.base), None)
     else:
@@ -129,34 +142,116 @@ def _solve(
     before, limit = known.depths(small), np.maximum(own, 0.0)
     # what meets at a joint goes no deeper than it is: on the skin, where that is looked at
     inner = np.array([p.adjacent for p in pairs])
-    most = np.where(inner, np.maximum(before, 0.0) + 0.001 if looks is None else np.inf, limit)
+    most = np.where(inner, np.maximum(before, 0.0) + 0.001 if reference is None else np.inf, limit)
     allowed = np.where(inner, np.minimum(most, 1e3), limit + ALLOWED_EXCESS)
-    asked = Asked(character, so_far, small, at, known, groups[0].turns, own, allowed, np.maximum(most, limit), touching,
-                  looks is not None)  # fmt: skip
-
+    asked = Asked(character, so_far, at, known, groups[0].turns, own, allowed, np.maximum(most, limit), touching,
+                  reference is not None)  # fmt: skip
     gap_before = asked.gaps(small, before)
     apart, worst = np.where(touching, gap_before - TOUCH, 0.0), np.where(inner, 0.0, before - limit)
-    if max(worst.max(initial=0.0) - TOLERANCE, apart.max(initial=0.0)) <= 0.0:
-        return so_far, _told(pairs, before - limit, before - limit, gap_before, gap_before, touching)
-    faults = _faults(worst, apart, np.zeros((1, 1)))
-    best = Attempt(asked, so_far, looks)
+    wrong = np.maximum(worst - TOLERANCE, apart).max(axis=1) > 0.0
+    windows = _windows(wrong, round(BESIDE / at.dt))
+    if sum(w.stop - w.start for w in windows) > MUCH * len(wrong):
+        windows = [slice(0, len(wrong))]
+    parts, history, left, least = [], (), False, max((w.stop - w.start for w in windows), default=0)
+    rounds = 0
+
+    def told_round() -> None:
+        nonlocal rounds
+        rounds += 1
+        tell(min(rounds / (ROUNDS * len(windows)), 1.0))
+
+    for seen in windows:
+        part = asked.part(seen, spacing, least)
+        looks = skin_looks(clip[at.frames[seen]], character, reference)
+        result, sinks, more = _best(part, _faults(worst[seen], apart[seen], np.zeros((1, 1))), bool((apart[seen] > 0.0).any()), looks,
+                             told_round)  # fmt: skip
+        parts, history, left = [*parts, result], (*history, *more), left or sinks
+    result = parts[0] if len(parts) == 1 and windows[0] == slice(0, len(wrong)) else _put_in(so_far, parts, windows, at)
+    moved = at.motion(result.motion)
+    after = known.depths(moved)
+    told = _told(pairs, before - limit, after - limit, gap_before, asked.gaps(moved, after), touching)
+    left = left or np.where(inner, 0.0, after - limit).max() > TOLERANCE
+    return dataclasses.replace(result, history=(*so_far.history, *history),
+                               status="violations_left" if left else so_far.status), told  # fmt: skip
+
+
+def _windows(wrong: Bool[np.ndarray, " seen"], beside: int) -> list[slice]:
+    """The frames in which something is wrong and those beside them, run by run."""
+    around = maximum_filter1d(wrong, 2 * beside + 1)
+    ends = np.flatnonzero(np.diff(np.pad(around.astype(int), 1)))
+    # the skin is asked in each third frame
+    return [slice(int(low) - int(low) % EVERY, int(high)) for low, high in zip(ends[::2], ends[1::2], strict=True)]
+
+
+def _best(
+    asked: Asked, faults: float, lost: bool, looks: SkinLooks | None, tell: Callable[[], None]
+) -> tuple[Fit, bool, tuple]:  # fmt: skip
+    """The best fit that some rounds find, whether its skin shows too much, and what the solves did. What makes matters worse is let be, as is a touch
+    that cannot be had without sinking in elsewhere."""
+    best = Attempt(asked, asked.so_far, looks)
     best.go_on(TRIAL, tell)
-    if not best.done and best.faults > WELL and (apart > 0.0).any():
+    if not best.done and best.faults > WELL and lost:
         # arms that were led out to either side of a trunk may not find together again from there
-        other = Attempt(asked, without_arms(so_far), None if looks is None else looks.anew())
+        other = Attempt(asked, without_arms(asked.so_far), None if looks is None else looks.anew())
         other.go_on(TRIAL, tell)
         best = min(best, other, key=lambda attempt: attempt.on_fields)
     best.go_on(ROUNDS, tell)
-    # a touch that cannot be had without sinking in elsewhere is given up, and so is all that makes matters worse
-    result, after = so_far, before
-    if best.result is not None and best.faults < faults:
-        result = eased("collisions_eased", so_far, best.result, at, sinking_skin(best.looks, small, at))
-        after = known.depths(at.motion(result.motion))
-    gap_after = asked.gaps(at.motion(result.motion), after)
-    told = _told(pairs, before - limit, after - limit, gap_before, gap_after, touching)
-    left = np.where(inner, 0.0, after - limit).max() > TOLERANCE
-    return dataclasses.replace(result, history=(*so_far.history, *best.history),
-                               status="violations_left" if left else so_far.status), told  # fmt: skip
+    if best.look_between():
+        best.go_on(best.rounds + PATIENCE, tell)
+    if best.result is None or best.faults >= faults:
+        return asked.so_far, False, best.history
+    # single frames that sink in are not worth a touch that lasts
+    less = eased(
+        "collisions_eased", asked.so_far, best.result, asked.at, sinking_skin(best.looks, asked.small, asked.at)
+    )
+    result = min(less, best.result, key=lambda fit: best.judged(fit).faults)
+    sinks = bool(best.judged(result).on_skin.max() > (1.0 - NEARLY) * TOLERANCE)
+    return result, sinks, best.history
+
+
+def _put_in(so_far: Fit, parts: list[Fit], windows: list[slice], at: Sampling) -> Fit:
+    """The fit with other motions in some windows of the frames that are seen, taken up and let go at their ends."""
+    whole, joints = np.array(so_far.motion.rotations, float), set()
+    fade = TAKEN_UP / float(so_far.motion.dt)
+    for part, seen in zip(parts, windows, strict=True):
+        start, frames = int(at.frames[seen.start]), part.motion.frame_count
+        at_start, at_end = start == 0, start + frames == len(whole)
+        way = np.arange(frames) / fade
+        share = np.minimum(np.inf if at_start else way, np.inf if at_end else way[::-1]) * np.ones(frames)
+        share = np.clip(share, 0.0, 1.0)
+        own = whole[start : start + frames]
+        mine = between("taken_up", cut(so_far, np.arange(start, start + frames)), part, share**2 * (3.0 - 2.0 * share))
+        rotations = np.asarray(mine.motion.rotations, float)
+        joints |= set(np.flatnonzero((own != rotations).any(axis=(0, 2))).tolist())
+        whole[start : start + frames] = rotations
+    motion = dataclasses.replace(so_far.motion, rotations=whole)
+    return put_down("collisions", so_far, motion, so_far.base, so_far.correction, sorted(joints)) if joints else so_far
+
+
+def cut(fit: Fit, frames: np.ndarray) -> Fit:
+    """Some frames of a fit, with the correction that it has there."""
+    controls = []
+    for control in fit.correction.controls:
+        drives = tuple(dataclasses.replace(d, axis_parent=d.axis_parent[frames]) if np.ndim(d.axis_parent) == 2 else d
+                       for d in control.drives)  # fmt: skip
+        controls.append(dataclasses.replace(control, drives=drives, basis=control.basis[frames]))
+    correction = Correction(tuple(controls), fit.correction.points)
+    return dataclasses.replace(fit, correction=correction, motion=fit.motion[frames], base=fit.base[frames])
+
+
+class Shown(NamedTuple):
+    """What a motion shows, in metres; positive is too much of it in the last three."""
+
+    probes: Float[np.ndarray, "frames rows points"]
+    depths: Float[np.ndarray, "frames rows"]
+    gap: Float[np.ndarray, "frames rows"]
+    over: Float[np.ndarray, "frames rows"]
+    apart: Float[np.ndarray, "frames rows"]
+    on_skin: Float[np.ndarray, "looks pairs"]
+
+    @property
+    def faults(self) -> float:
+        return _faults(self.over, self.apart, self.on_skin)
 
 
 class Attempt:
@@ -171,7 +266,7 @@ class Attempt:
         motion, at, known = start.motion, asked.at, asked.known
         self.seen = dataclasses.replace(motion[at.rows], dt=np.asarray(at.dt))
         self.controls = turn_controls(motion, at.whole, asked.turns)
-        self.points = Correction.zero(tuple(at.control(c) for c in self.controls))
+        self.points = self.best_points = Correction.zero(tuple(at.control(c) for c in self.controls))
         self.smooth = jerk_scale(motion)
         # in the frames around a touch the hand is on its way
         touching = maximum_filter1d(asked.touching.astype(float), 3, axis=0)
@@ -194,38 +289,54 @@ class Attempt:
         late, before = self.shown[-PATIENCE:], self.shown[:-PATIENCE]
         return bool(before) and min(late) >= BETTER * min(before)
 
+    def look_between(self) -> bool:
+        """Look at the best result in every second frame. Where more shows there, the rounds go on from it, and it is
+        judged by what was seen."""
+        if (
+            self.result is None
+            or self.looks is None
+            or not self.looks.look_between(self.asked.at.motion(self.result.motion))
+        ):
+            return False
+        self.points = self.best_points
+        self.faults = self.judged(self.result).faults
+        self.shown, self.done = [self.faults], False
+        return True
+
     def _round(self) -> None:
-        asked, at, known = self.asked, self.asked.at, self.asked.known
         result, history = self._solved()
         self.history += history
-        moved = at.motion(result.motion)
-        probes = known.probe_depths(moved)
-        depths = known.rows(probes)
-        gap = asked.gaps(moved, depths)
-        over, apart = depths - asked.most, np.where(asked.touching, gap - HELD, 0.0)
-        self.off = np.where(asked.touching, gap + depths, 0.0)
-        on_skin = np.zeros((1, 1))
-        if self.looks is not None:
-            if self.rounds in CLOSER:
-                # what was looked at in fewer frames cannot be compared
-                self.result, self.faults, self.shown = None, np.inf, []
-                self.looks.look_closer(joint_angles(moved, asked.small).max(axis=1))
-            own = self.looks.own
-            may = np.maximum(self.looks.depths(asked.small) - own, NEARLY * TOLERANCE)
-            on_skin = self.looks.depths_and_touches(moved) - own - may
-        self.on_fields = _faults(over, apart, np.zeros((1, 1)))
-        rough = rougher(result, asked.so_far)
+        if self.looks is not None and self.rounds in CLOSER:
+            # what was looked at in fewer frames cannot be compared
+            self.result, self.faults, self.shown = None, np.inf, []
+            moved = self.asked.at.motion(result.motion)
+            self.looks.look_closer(joint_angles(moved, self.asked.small).max(axis=1))
+        shown, rough = self.judged(result), rougher(result, self.asked.so_far)
+        self.off = np.where(self.asked.touching, shown.gap + shown.depths, 0.0)
+        self.on_fields = _faults(shown.over, shown.apart, np.zeros((1, 1)))
         if rough <= 0.01:
-            self.shown.append(_faults(over, apart, on_skin))
-            if self.shown[-1] < self.faults:
-                self.faults, self.result = self.shown[-1], result
-        self.done = max(over.max() - 0.7 * TOLERANCE, apart.max(), on_skin.max(), rough) <= 0.0
+            self.shown.append(shown.faults)
+            if shown.faults < self.faults:
+                self.faults, self.result, self.best_points = shown.faults, result, self.points
+        over, apart = shown.over, shown.apart
+        self.done = max(over.max() - 0.7 * TOLERANCE, apart.max(), shown.on_skin.max(), rough) <= 0.0
         if rough > 0.0:
             self.smooth *= 0.5
         self.allowed = self.allowed - np.where(over > 0.7 * TOLERANCE, np.minimum(over, 0.02), 0.0)
         self.gap = self.gap - np.where(apart > 0.0, np.minimum(apart + 0.003, 0.02), 0.0)
-        self.meetings.seen(probes, np.maximum(asked.own, 0.0), depths - asked.allowed)
+        self.meetings.seen(shown.probes, np.maximum(self.asked.own, 0.0), shown.depths - self.asked.allowed)
         self.rounds += 1
+
+    def judged(self, result: Fit) -> "Shown":
+        asked, moved = self.asked, self.asked.at.motion(result.motion)
+        probes = asked.known.probe_depths(moved)
+        depths = asked.known.rows(probes)
+        gap, on_skin = asked.gaps(moved, depths), np.zeros((1, 1))
+        if self.looks is not None:
+            own = self.looks.own
+            may = np.maximum(self.looks.depths(asked.small) - own, NEARLY * TOLERANCE)
+            on_skin = self.looks.depths_and_touches(moved) - own - may
+        return Shown(probes, depths, gap, depths - asked.most, np.where(asked.touching, gap - HELD, 0.0), on_skin)
 
     def _solved(self) -> tuple[Fit, tuple]:
         at = self.asked.at
@@ -293,9 +404,9 @@ def skin_gaps_near(
     return result
 
 
-def skin_looks(clip: Motion, character: Character, reference: Character | None, at: Sampling) -> SkinLooks | None:
-    """Looks at the skin of arms and legs in the frames that are seen; None without a reference."""
-    return None if reference is None else SkinLooks(clip[at.frames], character, reference, PAIRS)
+def skin_looks(seen: Motion, character: Character, reference: Character | None) -> SkinLooks | None:
+    """Looks at the skin of arms and legs in the frames of the clip that are seen; None without a reference."""
+    return None if reference is None else SkinLooks(seen, character, reference, PAIRS)
 
 
 def sinking_skin(looks: SkinLooks | None, small: Motion, at: Sampling) -> Callable[[Fit], Bool[np.ndarray, " seen"]]:

@@ -116,7 +116,7 @@ def _side(clip: Motion, character: Character, so_far: Fit, reference: Character 
         moved = probe_depths(clear.clearance, at.motion(result.motion))
         score = np.maximum(score, support(clear.clearance, moved, limit))
     # where a forearm cannot point there without sinking in, it comes back in the other frames
-    looks = skin_looks(clip, character, reference, at)
+    looks = skin_looks(clip[at.frames], character, reference)
     if looks is not None:
         looks.look_closer(joint_angles(at.motion(result.motion), small).max(axis=1))
     on_skin = sinking_skin(looks, small, at)

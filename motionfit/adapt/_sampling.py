@@ -38,11 +38,11 @@ class Sampling(NamedTuple):
         return dataclasses.replace(control, drives=drives, basis=self.basis)
 
 
-def sampling(clip: Motion, knot_spacing: float = KNOT_SPACING, rate: float = SOLVE_RATE) -> Sampling:
-    """The frames nearest to a `rate` [1/s], and knots every `knot_spacing` [s]."""
+def sampling(clip: Motion, knot_spacing: float = KNOT_SPACING, rate: float = SOLVE_RATE, least: int = 0) -> Sampling:
+    """The frames nearest to a `rate` [1/s], filled up to `least` rows or more, and knots every `knot_spacing` [s]."""
     step = max(1, round(clip.frame_rate / rate))
     frames = np.arange(0, clip.frame_count, step)
-    dt, length = float(clip.dt) * step, bucket(len(frames))
+    dt, length = float(clip.dt) * step, bucket(max(len(frames), least))
     rows = frames[np.minimum(np.arange(length), len(frames) - 1)]
     every = max(1, round(knot_spacing / dt)) * step
     return Sampling(frames, rows, dt, bspline_basis(length, dt, knot_spacing),
