@@ -51,7 +51,7 @@ def _swung_in(average, cycles, moments):
     base = mf.onto(samples.walk(cycles=cycles), average.skeleton)
     joint = average.skeleton.joint("left_upper_arm")
     time = np.arange(base.frame_count)
-    swing = 0.35 * sum(np.exp(-(((time - moment) / 8.0) ** 2)) for moment in moments)
+    swing = 0.35 * np.sum([np.exp(-(((time - moment) / 8.0) ** 2)) for moment in moments], axis=0)
     world = host_kinematics(base)[1][:, average.skeleton.parents[joint]]
     # about the forward axis, so that the hanging arm goes to the right
     axis = Rotation.from_quat(world, scalar_first=True).inv().apply([0.0, 0.0, -1.0])
