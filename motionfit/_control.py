@@ -1,5 +1,6 @@
 """The extra animation layer of thesis 4.3: controls that drive joints, and the correction that sets them."""
 
+import dataclasses
 import json
 import pathlib
 import zipfile
@@ -46,6 +47,12 @@ class Control(eqx.Module):
     upper: Float[AnyArray, ""] = eqx.field(
         converter=lambda x: np.asarray(x, float) if isinstance(x, float | int) else x, default=np.pi / 2
     )
+
+    def __getitem__(self, frames: Int[np.ndarray, " some"]) -> "Control":
+        """The same control in some frames only."""
+        drives = tuple(dataclasses.replace(d, axis_parent=d.axis_parent[frames]) if np.ndim(d.axis_parent) == 2 else d
+                       for d in self.drives)  # fmt: skip
+        return dataclasses.replace(self, drives=drives, basis=self.basis[frames])
 
     def signal(self, points: Float[AnyArray, " points"]) -> Float[Array, " frames"]:
         """The control's value in each frame [rad]."""

@@ -200,13 +200,13 @@ def _best(
         best.go_on(best.rounds + PATIENCE, tell)
     if best.result is None or best.faults >= faults:
         return asked.so_far, False, best.history
-    # single frames that sink in are not worth a touch that lasts
-    less = eased(
-        "collisions_eased", asked.so_far, best.result, asked.at, sinking_skin(best.looks, asked.small, asked.at)
-    )
-    result = min(less, best.result, key=lambda fit: best.judged(fit).faults)
-    sinks = bool(best.judged(result).on_skin.max() > (1.0 - NEARLY) * TOLERANCE)
-    return result, sinks, best.history
+    result, shown = best.result, best.judged(best.result)
+    sunk = sinking_skin(best.looks, asked.small, asked.at)
+    less = eased("collisions_eased", asked.so_far, result, asked.at, sunk)
+    if less is not result:
+        # single frames that sink in are not worth a touch that lasts
+        shown, result = min((best.judged(less), less), (shown, result), key=lambda tried: tried[0].faults)
+    return result, bool(shown.on_skin.max() > (1.0 - NEARLY) * TOLERANCE), best.history
 
 
 def _put_in(so_far: Fit, parts: list[Fit], windows: list[slice], at: Sampling) -> Fit:
@@ -230,12 +230,7 @@ def _put_in(so_far: Fit, parts: list[Fit], windows: list[slice], at: Sampling) -
 
 def cut(fit: Fit, frames: np.ndarray) -> Fit:
     """Some frames of a fit, with the correction that it has there."""
-    controls = []
-    for control in fit.correction.controls:
-        drives = tuple(dataclasses.replace(d, axis_parent=d.axis_parent[frames]) if np.ndim(d.axis_parent) == 2 else d
-                       for d in control.drives)  # fmt: skip
-        controls.append(dataclasses.replace(control, drives=drives, basis=control.basis[frames]))
-    correction = Correction(tuple(controls), fit.correction.points)
+    correction = Correction(tuple(c[frames] for c in fit.correction.controls), fit.correction.points)
     return dataclasses.replace(fit, correction=correction, motion=fit.motion[frames], base=fit.base[frames])
 
 

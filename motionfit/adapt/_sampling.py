@@ -31,11 +31,7 @@ class Sampling(NamedTuple):
 
     def control(self, control: Control) -> Control:
         """A control of the whole clip, as it is seen."""
-        drives = tuple(
-            dataclasses.replace(d, axis_parent=d.axis_parent[self.rows]) if np.ndim(d.axis_parent) == 2 else d
-            for d in control.drives
-        )
-        return dataclasses.replace(control, drives=drives, basis=self.basis)
+        return dataclasses.replace(control[self.rows], basis=self.basis)
 
 
 def sampling(clip: Motion, knot_spacing: float = KNOT_SPACING, rate: float = SOLVE_RATE, least: int = 0) -> Sampling:
