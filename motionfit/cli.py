@@ -3,6 +3,8 @@
 Bad input ends with one line on stderr and status 2; a violation that is left over the tolerance with status 3.
 """
 
+import copy
+import dataclasses
 import json
 import math
 import pathlib
@@ -15,6 +17,7 @@ import typer
 
 if TYPE_CHECKING:
     from motionfit._fit import BlockReport
+    from motionfit._motion import Motion
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False,
                   help="Adapt motion clips to the shape of a character.")  # fmt: skip
@@ -223,8 +226,7 @@ def run_adapt(
         measured = _measure_all(body, motions, base, motion.source_on(body.fingerprint), other, progress)
     mf.save(out, motions["after"], body)
     excess = {k: m.pop("_excess") for k, m in measured.items()}
-    pairs = [p.name for p in mf.shape.PAIRS]
-    left = measured["after"]["penetration"]["frames_over_1cm"] > 0
+    left = measured["after"]["penetration"]["skin"]["frames_over_1cm"] > 0
     status = ("violations_left" if left else "converged") if fit is None else fit.status
     total = time.perf_counter() - started
     data = {
@@ -243,7 +245,9 @@ def run_adapt(
 
         slides = [measured[k]["feet"]["slide_path_m"] for k in ("before", "after")]
         feet = "" if None in slides else ", planted feet slide {:.0f} -> {:.0f} cm".format(*(100 * s for s in slides))
-        report_picture(plot, body, base, motions["after"], excess["before"], excess["after"], pairs,
+        apart = _looks_apart(base)
+        before, after = (dataclasses.replace(m[::apart], dt=apart * float(m.dt)) for m in (base, motions["after"]))
+        report_picture(plot, body, before, after, excess["before"], excess["after"], [p.name for p in mf.shape.PAIRS],
                        f"{clip} on {body.name}: {status.replace('_', ' ')}{feet}")  # fmt: skip
     _print_table(measured)
     typer.echo(
@@ -291,8 +295,15 @@ class _CompileClock:
             self.seconds += duration_secs
 
 
+def _looks_apart(motion: "Motion") -> int:
+    """Every which frame the skin is looked at: about 15 per second, between which a limb sinks in or out by some
+    millimetres."""
+    return max(1, round(motion.frame_rate / 15))
+
+
 def _measure_all(body, motions: dict, source, clip, reference, progress) -> dict[str, dict]:
-    """An M of report.json per motion; `_excess` holds the excess depths on the volumes for the picture."""
+    """An M of report.json per motion; `_excess` holds the excess depths on the skin, in every frame that was looked at,
+    for the picture."""
     import motionfit as mf
     from motionfit.adapt import build_clearance, measure_standing, reference_depths, source_stance, volume_depths
     from motionfit.metrics import measure, skin_depths
@@ -300,9 +311,7 @@ def _measure_all(body, motions: dict, source, clip, reference, progress) -> dict
     pairs = mf.shape.PAIRS
     clearance = build_clearance(body, pairs)
     limit = reference_depths(clip, body, reference, pairs)
-    # about 15 looks per second at the skin, between which a limb sinks in or out by some millimetres
-    some = next(iter(motions.values()))
-    step = max(1, round(some.frame_rate / 15))
+    step = _looks_apart(next(iter(motions.values())))
     own = original = None
     if reference is not None:
         original = mf.onto(clip, reference.skeleton)
@@ -310,16 +319,15 @@ def _measure_all(body, motions: dict, source, clip, reference, progress) -> dict
     stance = source_stance(body, source, reference, original)
     result = {}
     for name, motion in motions.items():
+        if (same := next((k for k in result if motions[k] is motion), None)) is not None:
+            result[name] = copy.deepcopy(result[same])
+            continue
         excess = volume_depths(clearance, motion) - limit
-        same = next((k for k in result if motions[k] is motion), None)
-        if same is not None:
-            result[name] = json.loads(json.dumps({k: v for k, v in result[same].items() if k != "_excess"}))
-        else:
-            skin = skin_depths(body, motion, step=step, progress=progress.task(f"skin {name}"))
-            standing = measure_standing(body, motion, stance)
-            result[name] = measure(motion, source, volume_excess=excess, skin=skin, reference=own,
-                                   feet=standing["feet"], balance=standing["balance"])  # fmt: skip
-        result[name]["_excess"] = excess
+        skin = skin_depths(body, motion, step=step, progress=progress.task(f"skin {name}"))
+        standing = measure_standing(body, motion, stance)
+        result[name] = measure(motion, source, volume_excess=excess, skin=skin, reference=own,
+                               feet=standing["feet"], balance=standing["balance"])  # fmt: skip
+        result[name]["_excess"] = skin.depth - (0.0 if own is None else own.depth)
     return result
 
 
@@ -359,11 +367,11 @@ def _print_table(columns: dict[str, dict]) -> None:
             cells.append("-" if value is None else form.format(scale * value))
         table.add_row(label, *cells)
 
-    line("deepest excess, volumes (cm)", "penetration", "excess_max_m", scale=100)
-    line("frames over 1 cm, volumes (%)", "penetration", "frames_over_1cm", scale=100)
     line("deepest excess, skin (cm)", "penetration", "skin", "excess_max_m", scale=100)
     line("frames over 1 cm, skin (%)", "penetration", "skin", "frames_over_1cm", scale=100)
     line("skin inside other parts (%)", "penetration", "skin", "inside_ratio", scale=100, form="{:.2f}")
+    line("deepest excess, volumes (cm)", "penetration", "excess_max_m", scale=100)
+    line("frames over 1 cm, volumes (%)", "penetration", "frames_over_1cm", scale=100)
     line("planted foot slides, in all (cm)", "feet", "slide_path_m", scale=100)
     line("deepest under the floor (cm)", "feet", "ground_penetration_max_m", scale=100)
     line("ZMP from its support, mean (cm)", "balance", "zmp_distance_mean_m", scale=100)

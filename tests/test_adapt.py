@@ -49,6 +49,15 @@ def test_heavy_body_comes_clean_and_stays_itself(fitted, heavy, average):
     assert np.array_equal(np.asarray(fitted.motion.rotations)[:, still], np.asarray(fitted.base.rotations)[:, still])
 
 
+def test_without_a_reference_the_skin_may_show_what_it_shows_at_rest(heavy):
+    """Nothing, then, since what lies inside at bind is the joint itself; and what is clean comes back as it is."""
+    fit = mf.adapt(samples.walk(cycles=2), heavy)
+    before, after = (skin_depths(heavy, m, step=3).depth.max(axis=1) > 0.01 for m in (fit.base, fit.motion))
+    assert before.mean() > 0.9 and after.mean() <= 0.02
+    assert fit.status == "converged" and (derivative_ratio(fit.motion, fit.base, 3) or 9.0) <= 1.05
+    assert joint_angles(mf.adapt(fit.motion, heavy).motion, fit.motion).max() < np.deg2rad(0.1)
+
+
 @pytest.mark.parametrize("ending", [None, ".glb", ".npz"])
 def test_adapting_again_changes_nearly_nothing(ending, fitted, heavy, average, tmp_path):
     """The adapted clip, and its file, know what they were made from."""

@@ -26,14 +26,14 @@ from motionfit.adapt._collisions import (
     hands_meet,
     on_top,
     sinking_skin,
-    skin_looks,
     without_arms,
 )
 from motionfit.adapt._controls import turn_controls
 from motionfit.adapt._groups import GROUPS, MOST, PROBES, Meetings, arm_turns, known_depths
+from motionfit.adapt._limits import SkinLooks
 from motionfit.adapt._sampling import sampling
 from motionfit.metrics import skin_depths, skin_gaps
-from motionfit.shape.pairs import Pair
+from motionfit.shape.pairs import PAIRS, Pair
 from motionfit.splines import bspline_basis
 from motionfit.terms import Direction
 from motionfit.terms.penetration import hinge
@@ -120,8 +120,7 @@ def test_what_sinks_in_on_the_skin_gives_way_there_and_nowhere_else(average):
     time = np.arange(at.basis.count) / (at.whole.count - 1)
     in_then_out = 0.3 * (np.exp(-(((time - 0.75) / 0.1) ** 2)) - np.exp(-(((time - 0.25) / 0.1) ** 2)))
     mine, so_far = Correction(controls, (in_then_out,)), _as_fit(base, base, average)
-    whole, looks, small = on_top(so_far, mine, at), skin_looks(base[at.frames], average, average), at.motion(base)
-    assert looks is not None
+    whole, looks, small = on_top(so_far, mine, at), SkinLooks(base[at.frames], average, average, PAIRS), at.motion(base)
     looks.look_closer(joint_angles(at.motion(whole.motion), small).max(axis=1))
     result = eased("eased", so_far, whole, at, sinking_skin(looks, small, at))
 
@@ -176,6 +175,43 @@ def test_a_hand_that_left_the_head_comes_back_to_it_and_nothing_sinks_in(average
     assert (skin_depths(average, fit.motion).depth - skin_depths(average, source).depth).max() < 0.01
     told = fit.details["collisions"]["right_hand/head"]
     assert told["touching_before"] < 0.5 and told["touching_after"] == 1.0
+
+
+@pytest.mark.slow
+def test_arms_led_too_far_to_come_back_begin_again_without_it(sunk, average):
+    """The hand of the source is at the thigh; the turns of the table do not reach back from where the arm was led."""
+    source = sunk[1]
+    out = Turn("arm_out", (("left_upper_arm", "forward", 1.0),), 0.5)
+    at = sampling(source, 2 / 60)
+    led = Correction(turn_controls(source, at.whole, [out]), (np.full(at.basis.count, 1.2),))
+    so_far = on_top(_as_fit(source, source, average), led, at)
+    group = Group("hand/thigh", ("left_hand",), ("left_thigh",), (out,))
+    fit = mf.adapt.collisions(source, average, so_far, reference=average, groups=(group,))
+    told = fit.details["collisions"]["left_hand/left_thigh"]
+    assert told["touching_before"] == 0.0 and told["touching_after"] == 1.0
+    np.testing.assert_allclose(fit.correction.apply(fit.base).rotations, fit.motion.rotations, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_where_more_shows_between_the_looks_the_rounds_go_on(sunk, average, monkeypatch):
+    base, bad = sunk
+    group = Group("hand/thigh", ("left_hand",), ("left_thigh",), (Turn("out", (("left_upper_arm", "forward", 1.0),)),))
+    rounds, asked, one_round = [], [], Attempt._round
+
+    def counted(self):
+        rounds.append(self.rounds)
+        one_round(self)
+
+    def more_shows(self, motion):
+        asked.append(len(rounds))
+        assert joint_angles(motion, sampling(bad, 2 / 60).motion(bad)).max() > 0.01  # the result is what is looked at
+        return True
+
+    monkeypatch.setattr(Attempt, "_round", counted)
+    monkeypatch.setattr(SkinLooks, "look_between", more_shows)
+    fit = mf.adapt.collisions(base, average, _as_fit(bad, base, average), groups=(group,))
+    assert len(asked) == 1 and 0 < asked[0] < len(rounds)
+    assert fit.details["collisions"]["left_hand/left_thigh"]["excess_after_m"] < 0.01
 
 
 def test_a_clip_without_collisions_comes_back(sunk, average):

@@ -33,6 +33,7 @@ from motionfit.shape.pairs import PAIRS, Pair
 from motionfit.terms.pose import Effort, Smoothness
 
 ALLOWED_EXCESS = 0.004  # [m] that may stay where more was
+ROOM = 0.001  # [m] on the skin for what shows as much as it may
 TOUCH = 0.02  # [m] from the surface: what counts as a touch on fields, and what a touch may come to
 TOUCHED = 0.01  # [m] on the reference's skin, which knows better
 TOUCH_AIM = 0.012  # [m] a touch is brought back to
@@ -65,7 +66,8 @@ def collisions(
     Where a hand touched on the reference (within 1 cm, on the skin), it is brought back to within 2 cm of the surface,
     as far as nothing sinks in for it. Without a reference, what the character shows with the clip before any correction
     may stay and touches, by the fields. What the arm and leg blocks reached is not undone: their pairs are in the
-    tables, and with a reference what their skins show more becomes rows of the solve, as in `motionfit.adapt.limbs`.
+    tables, and what their skins show more than on the reference (without one: than so far) becomes rows of the solve,
+    as in `motionfit.adapt.limbs`.
     Where touches were lost, and two rounds do not bring them back, arms without any correction are another start: from
     where the arm block led them, to either side of a heavy trunk, hands may not find together again.
 
@@ -142,7 +144,7 @@ def _solve(
     before, limit = known.depths(small), np.maximum(own, 0.0)
     # what meets at a joint goes no deeper than it is: on the skin, where that is looked at
     inner = np.array([p.adjacent for p in pairs])
-    most = np.where(inner, np.maximum(before, 0.0) + 0.001 if reference is None else np.inf, limit)
+    most = np.where(inner, np.inf, limit)
     allowed = np.where(inner, np.minimum(most, 1e3), limit + ALLOWED_EXCESS)
     asked = Asked(character, so_far, at, known, groups[0].turns, own, allowed, np.maximum(most, limit), touching,
                   reference is not None)  # fmt: skip
@@ -162,9 +164,9 @@ def _solve(
 
     for seen in windows:
         part = asked.part(seen, spacing, least)
-        looks = skin_looks(clip[at.frames[seen]], character, reference)
-        result, sinks, more = _best(part, _faults(worst[seen], apart[seen], np.zeros((1, 1))), bool((apart[seen] > 0.0).any()), looks,
-                             told_round)  # fmt: skip
+        looks, lost = SkinLooks(clip[at.frames[seen]], character, reference, PAIRS), bool((apart[seen] > 0.0).any())
+        faults = _faults(worst[seen], apart[seen], np.zeros((1, 1)))
+        result, sinks, more = _best(part, faults, lost, looks, told_round)
         parts, history, left = [*parts, result], (*history, *more), left or sinks
     result = parts[0] if len(parts) == 1 and windows[0] == slice(0, len(wrong)) else _put_in(so_far, parts, windows, at)
     moved = at.motion(result.motion)
@@ -184,15 +186,15 @@ def _windows(wrong: Bool[np.ndarray, " seen"], beside: int) -> list[slice]:
 
 
 def _best(
-    asked: Asked, faults: float, lost: bool, looks: SkinLooks | None, tell: Callable[[], None]
+    asked: Asked, faults: float, lost: bool, looks: SkinLooks, tell: Callable[[], None]
 ) -> tuple[Fit, bool, tuple]:  # fmt: skip
-    """The best fit that some rounds find, whether its skin shows too much, and what the solves did. What makes matters worse is let be, as is a touch
-    that cannot be had without sinking in elsewhere."""
+    """The best fit that some rounds find, whether its skin shows too much, and what the solves did. What makes matters
+    worse is let be, as is a touch that cannot be had without sinking in elsewhere."""
     best = Attempt(asked, asked.so_far, looks)
     best.go_on(TRIAL, tell)
     if not best.done and best.faults > WELL and lost:
         # arms that were led out to either side of a trunk may not find together again from there
-        other = Attempt(asked, without_arms(asked.so_far), None if looks is None else looks.anew())
+        other = Attempt(asked, without_arms(asked.so_far), looks.anew())
         other.go_on(TRIAL, tell)
         best = min(best, other, key=lambda attempt: attempt.on_fields)
     best.go_on(ROUNDS, tell)
@@ -252,7 +254,7 @@ class Shown(NamedTuple):
 class Attempt:
     """Rounds of solves from one start: of what one of them leaves, the next is asked for more."""
 
-    def __init__(self, asked: Asked, start: Fit, looks: SkinLooks | None):
+    def __init__(self, asked: Asked, start: Fit, looks: SkinLooks):
         self.asked, self.start, self.looks = asked, start, looks
         self.result: Fit | None = None  # the best so far
         self.faults, self.shown = np.inf, []  # the least so far, and those of each round that can be compared
@@ -287,11 +289,7 @@ class Attempt:
     def look_between(self) -> bool:
         """Look at the best result in every second frame. Where more shows there, the rounds go on from it, and it is
         judged by what was seen."""
-        if (
-            self.result is None
-            or self.looks is None
-            or not self.looks.look_between(self.asked.at.motion(self.result.motion))
-        ):
+        if self.result is None or not self.looks.look_between(self.asked.at.motion(self.result.motion)):
             return False
         self.points = self.best_points
         self.faults = self.judged(self.result).faults
@@ -301,7 +299,7 @@ class Attempt:
     def _round(self) -> None:
         result, history = self._solved()
         self.history += history
-        if self.looks is not None and self.rounds in CLOSER:
+        if self.rounds in CLOSER:
             # what was looked at in fewer frames cannot be compared
             self.result, self.faults, self.shown = None, np.inf, []
             moved = self.asked.at.motion(result.motion)
@@ -326,23 +324,20 @@ class Attempt:
         asked, moved = self.asked, self.asked.at.motion(result.motion)
         probes = asked.known.probe_depths(moved)
         depths = asked.known.rows(probes)
-        gap, on_skin = asked.gaps(moved, depths), np.zeros((1, 1))
-        if self.looks is not None:
-            own = self.looks.own
-            may = np.maximum(self.looks.depths(asked.small) - own, NEARLY * TOLERANCE)
-            on_skin = self.looks.depths_and_touches(moved) - own - may
+        gap, own = asked.gaps(moved, depths), self.looks.own
+        may = np.maximum(self.looks.depths(asked.small) - own + ROOM, NEARLY * TOLERANCE)
+        on_skin = self.looks.depths_and_touches(moved) - own - may
         return Shown(probes, depths, gap, depths - asked.most, np.where(asked.touching, gap - HELD, 0.0), on_skin)
 
     def _solved(self) -> tuple[Fit, tuple]:
         at = self.asked.at
         rows = np.arange(len(at.rows))
+        may = 0.0 if self.asked.by_skin else self.looks.depths(self.asked.small)
         terms = {"collisions": self.meetings.term(self.allowed, self.gap - self.off, self.weight),
                  "effort": During(Effort(EFFORT), (rows < len(at.frames)).astype(float)),
-                 "smoothness": During(Smoothness(self.smooth), (rows < len(at.frames) - 2).astype(float))}  # fmt: skip
-        if self.looks is not None:
-            terms["skin"] = self.looks.touch_term(np.arange(len(PAIRS)), ALLOWED_EXCESS, len(at.rows))
-        weights = None if self.looks is None else {"skin": STIFFER}
-        problem = Problem(self.asked.character, self.seen, terms, self.points.controls, weights)
+                 "smoothness": During(Smoothness(self.smooth), (rows < len(at.frames) - 2).astype(float)),
+                 "skin": self.looks.touch_term(np.arange(len(PAIRS)), ALLOWED_EXCESS, len(at.rows), may)}  # fmt: skip
+        problem = Problem(self.asked.character, self.seen, terms, self.points.controls, {"skin": STIFFER})
         block = Block("collisions", tuple(c.name for c in self.controls), max_steps=24, tolerance=1e-3)
         solved = fit(problem, (block,), correction=self.points)
         # a point beyond its bound would stay there: no row changes with it
@@ -399,16 +394,9 @@ def skin_gaps_near(
     return result
 
 
-def skin_looks(seen: Motion, character: Character, reference: Character | None) -> SkinLooks | None:
-    """Looks at the skin of arms and legs in the frames of the clip that are seen; None without a reference."""
-    return None if reference is None else SkinLooks(seen, character, reference, PAIRS)
-
-
-def sinking_skin(looks: SkinLooks | None, small: Motion, at: Sampling) -> Callable[[Fit], Bool[np.ndarray, " seen"]]:
+def sinking_skin(looks: SkinLooks, small: Motion, at: Sampling) -> Callable[[Fit], Bool[np.ndarray, " seen"]]:
     """Says of a fit in which of the frames that are seen an arm or leg sinks in that was out in `small`: at a shoulder
     the fields, which controls are solved by, do not know the skin."""
-    if looks is None:
-        return lambda fit: np.zeros(small.frame_count, bool)
     most = np.maximum(looks.depths(small) - looks.own, NEARLY * TOLERANCE)
 
     def sunk(fit: Fit) -> Bool[np.ndarray, " seen"]:

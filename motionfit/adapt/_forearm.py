@@ -18,13 +18,15 @@ from motionfit._programs import program
 from motionfit._skeleton import SIDES
 from motionfit._solve import Block, block_adjoint, block_solver, block_work, solve_block
 from motionfit.adapt._clearance import probe_depths, reduced, support
-from motionfit.adapt._collisions import eased, on_top, sinking_skin, skin_looks
+from motionfit.adapt._collisions import eased, on_top, sinking_skin
 from motionfit.adapt._controls import Turn, turn_controls
 from motionfit.adapt._groups import Group, filled, known_depths
 from motionfit.adapt._limbs import SOLVE_PROBES, jerk_scale, smooth_floor
+from motionfit.adapt._limits import SkinLooks
 from motionfit.adapt._record import put_down
 from motionfit.adapt._sampling import sampling
 from motionfit.metrics import TOLERANCE, derivative_ratio
+from motionfit.shape.pairs import PAIRS
 from motionfit.terms.pose import Direction, Effort, Smoothness
 
 GRID = 0.1  # [rad] between the starts, 4.4.2
@@ -116,9 +118,8 @@ def _side(clip: Motion, character: Character, so_far: Fit, reference: Character 
         moved = probe_depths(clear.clearance, at.motion(result.motion))
         score = np.maximum(score, support(clear.clearance, moved, limit))
     # where a forearm cannot point there without sinking in, it comes back in the other frames
-    looks = skin_looks(clip[at.frames], character, reference)
-    if looks is not None:
-        looks.look_closer(joint_angles(at.motion(result.motion), small).max(axis=1))
+    looks = SkinLooks(clip[at.frames], character, reference, PAIRS)
+    looks.look_closer(joint_angles(at.motion(result.motion), small).max(axis=1))
     on_skin = sinking_skin(looks, small, at)
 
     def sunk(fit: Fit) -> Bool[np.ndarray, " seen"]:

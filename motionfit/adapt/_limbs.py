@@ -166,8 +166,8 @@ def limbs(
     """Take the arms out of the trunk and the thighs, and the legs out of each other.
 
     The solver sees 30 frames per second, and the skin's probes that matter. An arm that turns far begins again from
-    other turns; the least cost counts. Afterwards all probes are looked at, with a reference also the skinned mesh
-    itself at some frames, and the jerk. Where the skins touch becomes rows of the solve, where more than the tolerance
+    other turns; the least cost counts. Afterwards all probes are looked at, the skinned mesh itself at some
+    frames, and the jerk. Where the skins touch becomes rows of the solve, where more than the tolerance
     is left the fields get less room, where the jerk grew the correction gets smoother, and the blocks run again from
     where they were.
 
@@ -263,9 +263,7 @@ def _case(
     everything = build_clearance(character, pairs_of(*blocks), objective)
     source = source[seen.frames]
     own = reference_depths(source, character, reference, everything.pairs, objective)
-    looks = None
-    if reference is not None and objective == "vertex":
-        looks = SkinLooks(source, character, reference, everything.pairs)
+    looks = SkinLooks(source, character, reference, everything.pairs) if objective == "vertex" else None
     return Case(character, base, controls, basis, seen, everything, own, looks)
 
 

@@ -51,10 +51,11 @@ class SkinLooks:
     one pose says. So what touches in a look becomes rows for the solver.
 
     A look takes ten milliseconds or more, so no pose is looked at twice: what a frame showed is kept here, and what the
-    reference shows is kept with the reference, for the next body.
+    reference shows is kept with the reference, for the next body. Without a reference nothing is allowed: what lies
+    inside in the rest pose never counts (`motionfit.metrics.skin_depths`).
     """
 
-    def __init__(self, clip: Motion, character: Character, reference: Character, pairs: tuple[Pair, ...]):
+    def __init__(self, clip: Motion, character: Character, reference: Character | None, pairs: tuple[Pair, ...]):
         """`clip` is what the reference plays, in the frames that the solver sees."""
         self.clip, self.character, self.reference, self.pairs = clip, character, reference, pairs
         self.frames = np.arange(clip.frame_count)
@@ -69,6 +70,8 @@ class SkinLooks:
 
     def _own(self, at: Int[np.ndarray, " some"]) -> Float[np.ndarray, "some pairs"]:
         """What the reference shows."""
+        if self.reference is None:
+            return np.zeros((len(at), len(self.pairs)))
         played = onto(self.clip[at], self.reference.skeleton)
         known = self.reference.memo.setdefault(("shown", self.pairs), {})
         poses = _poses(played)
@@ -116,9 +119,14 @@ class SkinLooks:
                 self.seen[keys[new[k]]] = Look(depths, touches)
         return {key: self.seen[key] for key in keys}
 
-    def touch_term(self, columns: Int[np.ndarray, " some"], allowed: float, length: int) -> TouchClearance:
-        """The touches of some pairs as rows for the solver, up to `allowed` [m] more than the reference shows."""
+    def touch_term(
+        self, columns: Int[np.ndarray, " some"], allowed: float, length: int,
+        least: float | Float[np.ndarray, "looks pairs"] = 0.0,
+    ) -> TouchClearance:  # fmt: skip
+        """The touches of some pairs as rows for the solver, up to `allowed` [m] more than the reference shows, or up to
+        a depth of `least` [m]."""
         rows = self.own + allowed + self.eased * np.maximum(self.deepest - allowed, 0.0)
+        rows = np.maximum(rows, least)
         limits = {int(frame): row for frame, row in zip(self.at, rows, strict=True)}
         return touch_term(self.character, self.touches, columns, limits, len(self.frames), length)
 

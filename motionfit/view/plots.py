@@ -57,7 +57,7 @@ def report_picture(
     pairs: list[str],
     title: str = "",
 ) -> None:
-    """Three moments before and after, and the excess depth [cm] of every pair that shows any, over time.
+    """Three moments before and after, and the excess depth [m] of every pair that shows any, over time.
 
     The moments are the worst frame before, and the worst of the thirds of the clip that it does not lie in.
     """
@@ -143,5 +143,6 @@ def _draw_curve(axes, motion: Motion, before, after, name: str, top: float, inde
         axes.spines[side].set_visible(False)
     if index % 3 == 0:
         axes.set_ylabel("excess [cm]", fontsize=9)
+    axes.set_xlabel("time [s]", fontsize=9)
     if index == 0:
         axes.legend(fontsize=8, frameon=False)
