@@ -20,13 +20,8 @@ from motionfit._motion import bind_pose
 from motionfit.metrics import posed_vertices
 from motionfit.shape import grow, parse_girth
 from motionfit.shape.distance import capsule_depth, closest_on_lines, cylinder_depth, segment_distance
-from motionfit.shape.field import (
-    depths,
-    fit_field,
-    make_probes,
-    standing,
-    standing_vertices,
-)
+from motionfit.shape.field import depths, fit_field, standing, standing_vertices
+from motionfit.shape.probes import make_probes
 from motionfit.shape.surface import inside_depths, may_be_inside, part_surface, surface_gap
 from motionfit.shape.volumes import fit_volumes
 from tests.helpers import central_difference

@@ -15,14 +15,9 @@ from motionfit._motion import Kinematics, Motion, forward_kinematics
 from motionfit._programs import program
 from motionfit._skeleton import SIDES
 from motionfit._types import InputError
-from motionfit.shape.field import (
-    Probes,
-    fit_field,
-    make_probes,
-    sample_vertices,
-    standing_vertices,
-)
+from motionfit.shape.field import fit_field, standing_vertices
 from motionfit.shape.pairs import Pair
+from motionfit.shape.probes import Probes, make_probes, sample_vertices
 from motionfit.shape.surface import inside_depths, part_surface
 from motionfit.shape.volumes import fit_volumes
 from motionfit.terms.penetration import CapsuleClearance, JointClearance, SkinClearance

@@ -16,8 +16,9 @@ from motionfit.adapt._clearance import Clearance, counted_probes, kept_with, poi
 from motionfit.adapt._controls import Turn
 from motionfit.adapt._limbs import smooth_floor
 from motionfit.adapt._sampling import Sampling
-from motionfit.shape.field import Probes, ProbeSets, fit_field
+from motionfit.shape.field import fit_field
 from motionfit.shape.pairs import Pair
+from motionfit.shape.probes import Probes, ProbeSets
 from motionfit.terms.penetration import SkinClearance, SkinContact
 
 PROBES = 16  # of a part against another, in a solve

@@ -43,9 +43,10 @@ from motionfit.adapt._limbs import _stages as limb_stages
 from motionfit.adapt._touches import touching_on
 from motionfit.banded import Banded
 from motionfit.metrics import skin_depths
-from motionfit.shape.field import DepthField, Probes, standing, standing_vertices
+from motionfit.shape.field import DepthField, standing, standing_vertices
 from motionfit.shape.growth import grow
 from motionfit.shape.pairs import pairs_of
+from motionfit.shape.probes import Probes
 from motionfit.shape.surface import part_surface
 from motionfit.shape.volumes import allocate_vertices, fit_volumes
 from motionfit.terms.penetration import CapsuleClearance, SkinClearance, TouchClearance

@@ -1,10 +1,11 @@
 """Body shape: volumes fitted to the skin, their distances and masses, girth and lengths, and the built-in bodies."""
 
 from motionfit.shape.distance import capsule_depth, cylinder_depth, segment_distance
-from motionfit.shape.field import DepthField, Probes, fit_field, make_probes
+from motionfit.shape.field import DepthField, fit_field
 from motionfit.shape.growth import grow, parse_girth
 from motionfit.shape.mass import Masses, anthropometric_masses, mass_volumes, mesh_masses, volume_masses
 from motionfit.shape.pairs import PAIRS, Pair
+from motionfit.shape.probes import Probes, make_probes
 from motionfit.shape.scaling import scale_character, scale_root, scale_skeleton
 from motionfit.shape.volumes import Volumes, allocate_vertices, fit_volumes
 

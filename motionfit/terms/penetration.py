@@ -15,7 +15,8 @@ from motionfit._motion import Kinematics
 from motionfit._problem import Term, pseudo_huber
 from motionfit._types import AnyArray
 from motionfit.shape.distance import capsule_depth, cylinder_depth
-from motionfit.shape.field import DepthField, Probes, ProbeSets, depths, depths_met
+from motionfit.shape.field import DepthField, depths, depths_met
+from motionfit.shape.probes import Probes, ProbeSets
 from motionfit.shape.volumes import Volumes
 
 
