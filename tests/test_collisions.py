@@ -17,20 +17,12 @@ from motionfit._control import Correction
 from motionfit._motion import Motion, host_kinematics, joint_angles, rest_motion
 from motionfit._solve import block_adjoint, block_solver, block_work, solve_block
 from motionfit.adapt import Group, Sphere, Turn, multi_start
-from motionfit.adapt._collisions import (
-    ROUNDS,
-    Attempt,
-    _windows,
-    between,
-    eased,
-    hands_meet,
-    on_top,
-    sinking_skin,
-    without_arms,
-)
+from motionfit.adapt._collisions import ROUNDS, Attempt, _windows, hands_meet, without_arms
 from motionfit.adapt._controls import turn_controls
+from motionfit.adapt._easing import between, eased, sinking_skin
 from motionfit.adapt._groups import GROUPS, MOST, PROBES, Meetings, arm_turns, known_depths
 from motionfit.adapt._limits import SkinLooks
+from motionfit.adapt._record import on_top
 from motionfit.adapt._sampling import sampling
 from motionfit.metrics import skin_depths, skin_gaps
 from motionfit.shape.pairs import PAIRS, Pair
@@ -93,6 +85,24 @@ def test_windows_are_the_runs_of_what_is_wrong_and_what_is_beside_it():
     wrong[[20, 24, 70, 99]] = True
     assert _windows(wrong, 10) == [slice(9, 35), slice(60, 81), slice(87, 100)]
     assert _windows(np.zeros(5, bool), 10) == [] and _windows(np.ones(5, bool), 10) == [slice(0, 5)]
+
+
+@pytest.mark.slow
+def test_what_sinks_in_where_it_is_taken_up_is_solved_in_more_frames_and_then_let_be(average, monkeypatch):
+    base, bad = _swung_in(average, 6, (200,))
+    out = Turn("arm_out", (("left_upper_arm", "forward", 1.0),))
+    group, lengths = Group("hand/thigh", ("left_hand",), ("left_thigh",), (out,)), []
+
+    def into_the_thigh(asked, *_):
+        lengths.append(len(asked.at.frames))
+        controls = turn_controls(asked.so_far.motion, asked.at.whole, [out])
+        inwards = Correction(controls, (np.full(asked.at.basis.count, -0.35),))
+        return on_top(asked.so_far, inwards, asked.at), False, ()
+
+    monkeypatch.setattr("motionfit.adapt._collisions._best", into_the_thigh)
+    fit = mf.adapt.collisions(base, average, _as_fit(bad, base, average), groups=(group,))
+    assert len(lengths) == 3 and lengths[0] < lengths[1] < lengths[2] < base.frame_count
+    np.testing.assert_array_equal(fit.motion.rotations, bad.rotations)
 
 
 @pytest.mark.slow
@@ -186,6 +196,8 @@ def test_arms_led_too_far_to_come_back_begin_again_without_it(sunk, average):
     led = Correction(turn_controls(source, at.whole, [out]), (np.full(at.basis.count, 1.2),))
     so_far = on_top(_as_fit(source, source, average), led, at)
     group = Group("hand/thigh", ("left_hand",), ("left_thigh",), (out,))
+    left = mf.adapt.collisions(source, average, so_far, reference=average, groups=(group,), worth=())
+    assert left.motion is so_far.motion  # a touch that is not worth a solve
     fit = mf.adapt.collisions(source, average, so_far, reference=average, groups=(group,))
     told = fit.details["collisions"]["left_hand/left_thigh"]
     assert told["touching_before"] == 0.0 and told["touching_after"] == 1.0

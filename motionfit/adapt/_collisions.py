@@ -11,11 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
-from scipy.spatial.transform import Rotation
 
 from motionfit._character import Character
 from motionfit._control import Correction
-from motionfit._fit import Fit, fit
+from motionfit._fit import BlockReport, Fit, fit
 from motionfit._motion import Motion, joint_angles
 from motionfit._onto import onto
 from motionfit._problem import During, Problem
@@ -23,12 +22,13 @@ from motionfit._skeleton import SIDES
 from motionfit._solve import Block
 from motionfit.adapt._clearance import all_rows, build_clearance
 from motionfit.adapt._controls import Turn, turn_controls
+from motionfit.adapt._easing import between, eased, rougher, sinking_skin
 from motionfit.adapt._groups import GROUPS, Group, Known, Meetings, known_depths
 from motionfit.adapt._limbs import jerk_scale
 from motionfit.adapt._limits import NEARLY, SkinLooks
-from motionfit.adapt._record import put_down
+from motionfit.adapt._record import on_top, put_down
 from motionfit.adapt._sampling import Sampling, sampling
-from motionfit.metrics import TOLERANCE, derivative_ratio, skin_gaps
+from motionfit.metrics import TOLERANCE, skin_gaps
 from motionfit.shape.pairs import PAIRS, Pair
 from motionfit.terms.pose import Effort, Smoothness
 
@@ -40,16 +40,14 @@ TOUCH_AIM = 0.012  # [m] a touch is brought back to
 HELD = 0.016  # [m] a solve is content with: where an arm then sinks in, a touch gives way a little
 NEAR, EVERY = 0.06, 3  # [m] by the fields: where the skin is asked, in each third frame that is seen
 EASE = 0.08  # [s] within which a touch is taken up and let go
-YIELDS = 0.2  # [s] around what sinks in, in which a correction gives way
 EFFORT = 1.0  # [rad]
-MOST_JERK = 1.04
 ROUNDS, PATIENCE = 12, 3  # rounds at most, and without a better result
 BETTER = 0.9  # of the best result so far, at most
 TRIAL, WELL = 2, 0.05  # rounds after which two starts are compared, and the faults below which there is no need to
 CLOSER = (0, 1, 2)  # rounds after which more frames are looked at
-GIVES = (0.1, 0.2, 0.3, *(0.5,) * 5)  # of what sinks in, one after the other: a touch bears little of it
 STIFFER = 4.0  # weight of what the skin shows, against the touches that pull the other way
 BESIDE, TAKEN_UP = 0.6, 0.3  # [s] around what is wrong: what is solved, and of it what a correction is taken up in
+WIDENED = 2  # times that such a run gets longer by BESIDE at both ends
 MUCH = 0.7  # of a clip, from which on it is solved as a whole
 WITHIN = 0.98  # of a control's bounds: where the points of a round begin
 ARM = ("clavicle", "upper_arm", "forearm", "hand")
@@ -59,7 +57,8 @@ MEANT = tuple(Pair(f"{side}_hand", part, "arms") for side, other in (SIDES, SIDE
 
 def collisions(
     clip: Motion, character: Character, so_far: Fit, *, reference: Character | None = None,
-    groups: Sequence[Group] = GROUPS, progress: Callable[[int, int], None] | None = None,
+    groups: Sequence[Group] = GROUPS, worth: Sequence[Pair] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Fit:  # fmt: skip
     """Take the groups' probes out of what they shall avoid, as far as they are deeper in than on `reference`.
 
@@ -71,7 +70,8 @@ def collisions(
     Where touches were lost, and two rounds do not bring them back, arms without any correction are another start: from
     where the arm block led them, to either side of a heavy trunk, hands may not find together again.
 
-    Only the frames around what is wrong are solved, run by run, unless they are most of the clip.
+    Only the frames around what is wrong are solved, run by run, unless they are most of the clip. A touch that is lost
+    is wrong if it is of one of the pairs that are `worth` it (None: all); others are kept where frames are solved.
 
     `progress(done, most)` is called after each round. `details["collisions"]` holds per pair the greatest excess [m]
     before and after, and the share of the touched frames that still touch.
@@ -83,7 +83,7 @@ def collisions(
             if progress is not None:
                 progress(round(100 * (k + share) / len(together)), 100)
 
-        result, more = _solve(clip, character, result, reference, some, tell)
+        result, more = _solve(clip, character, result, reference, some, worth, tell)
         told |= more
     return dataclasses.replace(result, details={**so_far.details, "collisions": told})
 
@@ -132,7 +132,7 @@ class Asked(NamedTuple):
 
 def _solve(
     clip: Motion, character: Character, so_far: Fit, reference: Character | None, groups: list[Group],
-    tell: Callable[[float], None],
+    worth: Sequence[Pair] | None, tell: Callable[[float], None],
 ) -> tuple[Fit, dict]:  # fmt: skip
     motion, known, spacing = so_far.motion, known_depths(character, groups), groups[0].spacing / 60.0
     at = sampling(motion, spacing)
@@ -150,31 +150,87 @@ def _solve(
                   reference is not None)  # fmt: skip
     gap_before = asked.gaps(small, before)
     apart, worst = np.where(touching, gap_before - TOUCH, 0.0), np.where(inner, 0.0, before - limit)
-    wrong = np.maximum(worst - TOLERANCE, apart).max(axis=1) > 0.0
-    windows = _windows(wrong, round(BESIDE / at.dt))
-    if sum(w.stop - w.start for w in windows) > MUCH * len(wrong):
-        windows = [slice(0, len(wrong))]
-    parts, history, left, least = [], (), False, max((w.stop - w.start for w in windows), default=0)
-    rounds = 0
-
-    def told_round() -> None:
-        nonlocal rounds
-        rounds += 1
-        tell(min(rounds / (ROUNDS * len(windows)), 1.0))
-
-    for seen in windows:
-        part = asked.part(seen, spacing, least)
-        looks, lost = SkinLooks(clip[at.frames[seen]], character, reference, PAIRS), bool((apart[seen] > 0.0).any())
-        faults = _faults(worst[seen], apart[seen], np.zeros((1, 1)))
-        result, sinks, more = _best(part, faults, lost, looks, told_round)
-        parts, history, left = [*parts, result], (*history, *more), left or sinks
-    result = parts[0] if len(parts) == 1 and windows[0] == slice(0, len(wrong)) else _put_in(so_far, parts, windows, at)
+    asked_for = np.array([worth is None or p[:2] in {w[:2] for w in worth} for p in pairs])
+    wrong = np.maximum(worst - TOLERANCE, np.where(asked_for, apart, 0.0)).max(axis=1) > 0.0
+    result, history, left = _run_by_run(asked, Wrong(clip, reference, worst, apart, wrong), spacing, tell)
     moved = at.motion(result.motion)
     after = known.depths(moved)
     told = _told(pairs, before - limit, after - limit, gap_before, asked.gaps(moved, after), touching)
     left = left or np.where(inner, 0.0, after - limit).max() > TOLERANCE
     return dataclasses.replace(result, history=(*so_far.history, *history),
                                status="violations_left" if left else so_far.status), told  # fmt: skip
+
+
+class Wrong(NamedTuple):
+    """What is wrong with a fit, per frame that is seen and row, and who shows what may stay: the clip on a reference."""
+
+    clip: Motion
+    reference: Character | None
+    worst: Float[np.ndarray, "frames rows"]  # [m] deeper than it may be
+    apart: Float[np.ndarray, "frames rows"]  # [m] farther than a touch
+    somewhere: Bool[np.ndarray, " frames"]
+
+    def looks(self, asked: Asked, seen: slice | np.ndarray) -> SkinLooks:
+        """Looks at the skin in some of the frames that are seen."""
+        return SkinLooks(self.clip[asked.at.frames[seen]], asked.character, self.reference, PAIRS)
+
+
+def _run_by_run(
+    asked: Asked, wrong: Wrong, spacing: float, tell: Callable[[float], None]
+) -> tuple[Fit, tuple[BlockReport, ...], bool]:
+    """The fit with each run of frames solved in which something is wrong, what the solves did, and whether the skin of
+    what is taken of them shows too much. Where an arm sinks in on its way from one motion to the other and back, the
+    run gets longer, and in the end it is let be."""
+    beside, seen = round(BESIDE / asked.at.dt), len(wrong.somewhere)
+    windows, known, rounds = _windows(wrong.somewhere, beside), {}, 0
+
+    def told_round() -> None:
+        nonlocal rounds
+        rounds += 1
+        tell(min(rounds / (ROUNDS * len(windows)), 1.0))
+
+    for widened in range(WIDENED + 1):
+        if sum(w.stop - w.start for w in windows) > MUCH * seen:
+            windows = [slice(0, seen)]
+        least = max((w.stop - w.start for w in windows), default=0)
+        for w in windows:
+            if (w.start, w.stop) not in known:
+                faults = _faults(wrong.worst[w], wrong.apart[w], np.zeros((1, 1)))
+                lost = bool((wrong.apart[w] > 0.0).any())
+                known[w.start, w.stop] = _best(asked.part(w, spacing, least), faults, lost, wrong.looks(asked, w), told_round)  # fmt: skip
+        taken = [w for w in windows if known[w.start, w.stop][0] is not None]
+        result = _put_in(asked, [known[w.start, w.stop][0] for w in taken], taken)
+        sinking = [w for w in taken if _ends_sink(asked, wrong, result, w)]
+        if not sinking:
+            break
+        if widened == WIDENED:
+            taken = [w for w in taken if w not in sinking]
+            result = _put_in(asked, [known[w.start, w.stop][0] for w in taken], taken)
+            break
+        around = np.zeros(seen, bool)
+        for w in windows:
+            more = beside if w in sinking else 0
+            around[max(w.start - more, 0) : w.stop + more] = True
+        windows = _windows(around, 0)
+    history = tuple(report for _, _, more in known.values() for report in more)
+    return result, history, any(known[w.start, w.stop][1] for w in taken)
+
+
+def _ends_sink(asked: Asked, wrong: Wrong, result: Fit, seen: slice) -> bool:
+    """Whether anything sinks in where a window's motion is taken up or let go."""
+    ends, length = round(TAKEN_UP / asked.at.dt) + 1, len(asked.at.frames)
+    first = np.arange(seen.start, min(seen.start + ends, seen.stop) if seen.start > 0 else seen.start)
+    last = np.arange(max(seen.stop - ends, seen.start) if seen.stop < length else seen.stop, seen.stop)
+    some = np.union1d(first, last)
+    if len(some) == 0:
+        return False
+    before, after = (asked.at.motion(fit.motion)[some] for fit in (asked.so_far, result))
+    was, now = (asked.known.depths(m) - asked.most[some] for m in (before, after))
+    if (now > np.maximum(was + ROOM, TOLERANCE)).any():
+        return True
+    looks = wrong.looks(asked, some)
+    may = np.maximum(looks.depths(before) - looks.own + ROOM, TOLERANCE)
+    return bool((looks.depths(after) - looks.own > may).any())
 
 
 def _windows(wrong: Bool[np.ndarray, " seen"], beside: int) -> list[slice]:
@@ -187,9 +243,9 @@ def _windows(wrong: Bool[np.ndarray, " seen"], beside: int) -> list[slice]:
 
 def _best(
     asked: Asked, faults: float, lost: bool, looks: SkinLooks, tell: Callable[[], None]
-) -> tuple[Fit, bool, tuple]:  # fmt: skip
-    """The best fit that some rounds find, whether its skin shows too much, and what the solves did. What makes matters
-    worse is let be, as is a touch that cannot be had without sinking in elsewhere."""
+) -> tuple[Fit | None, bool, tuple[BlockReport, ...]]:  # fmt: skip
+    """The best fit that some rounds find (None: none is better), whether its skin shows too much, and what the solves
+    did. What makes matters worse is let be, as is a touch that cannot be had without sinking in elsewhere."""
     best = Attempt(asked, asked.so_far, looks)
     best.go_on(TRIAL, tell)
     if not best.done and best.faults > WELL and lost:
@@ -201,7 +257,7 @@ def _best(
     if best.look_between():
         best.go_on(best.rounds + PATIENCE, tell)
     if best.result is None or best.faults >= faults:
-        return asked.so_far, False, best.history
+        return None, False, best.history
     result, shown = best.result, best.judged(best.result)
     sunk = sinking_skin(best.looks, asked.small, asked.at)
     less = eased("collisions_eased", asked.so_far, result, asked.at, sunk)
@@ -211,8 +267,11 @@ def _best(
     return result, bool(shown.on_skin.max() > (1.0 - NEARLY) * TOLERANCE), best.history
 
 
-def _put_in(so_far: Fit, parts: list[Fit], windows: list[slice], at: Sampling) -> Fit:
+def _put_in(asked: Asked, parts: list[Fit], windows: list[slice]) -> Fit:
     """The fit with other motions in some windows of the frames that are seen, taken up and let go at their ends."""
+    so_far, at = asked.so_far, asked.at
+    if windows == [slice(0, len(at.frames))]:
+        return parts[0]
     whole, joints = np.array(so_far.motion.rotations, float), set()
     fade = TAKEN_UP / float(so_far.motion.dt)
     for part, seen in zip(parts, windows, strict=True):
@@ -259,7 +318,8 @@ class Attempt:
         self.result: Fit | None = None  # the best so far
         self.faults, self.shown = np.inf, []  # the least so far, and those of each round that can be compared
         self.on_fields = np.inf  # those of the last round, but for what the skin shows: that takes more rounds to learn
-        self.done, self.rounds, self.history = False, 0, ()
+        self.done, self.rounds = False, 0
+        self.history: tuple[BlockReport, ...] = ()
         motion, at, known = start.motion, asked.at, asked.known
         self.seen = dataclasses.replace(motion[at.rows], dt=np.asarray(at.dt))
         self.controls = turn_controls(motion, at.whole, asked.turns)
@@ -394,53 +454,6 @@ def skin_gaps_near(
     return result
 
 
-def sinking_skin(looks: SkinLooks, small: Motion, at: Sampling) -> Callable[[Fit], Bool[np.ndarray, " seen"]]:
-    """Says of a fit in which of the frames that are seen an arm or leg sinks in that was out in `small`: at a shoulder
-    the fields, which controls are solved by, do not know the skin."""
-    most = np.maximum(looks.depths(small) - looks.own, NEARLY * TOLERANCE)
-
-    def sunk(fit: Fit) -> Bool[np.ndarray, " seen"]:
-        result = np.zeros(small.frame_count, bool)
-        result[looks.at] = (looks.depths(at.motion(fit.motion)) - looks.own > most).any(axis=1)
-        return result
-
-    return sunk
-
-
-def eased(name: str, so_far: Fit, result: Fit, at: Sampling, sunk: Callable[[Fit], Bool[np.ndarray, " seen"]]) -> Fit:
-    """A result that becomes `so_far` again, as far as need be, around the frames that show something `sunk`."""
-    dt = float(so_far.motion.dt)
-    share, whole, width = np.ones(so_far.motion.frame_count), result, EASE / dt
-    for gives in GIVES:
-        where = sunk(result)
-        if not where.any() and rougher(result, so_far) <= 0.01:
-            return result
-        around = np.zeros(len(share))
-        around[at.frames[where]] = 1.0
-        around = gaussian_filter1d(maximum_filter1d(around, 2 * round(YIELDS / dt) + 1), width)
-        share = share * (1.0 - gives * around) if where.any() else (1.0 - gives) * share
-        result = between(name, so_far, whole, share)
-    return so_far
-
-
-def rougher(fit: Fit, so_far: Fit) -> float:
-    """By how much the jerk of a fit, as a ratio to its base's, is more than it may be: that of `so_far` may stay."""
-    now, before = (derivative_ratio(f.motion, so_far.base, 3) or 1.0 for f in (fit, so_far))
-    return now - max(MOST_JERK, before)
-
-
-def between(name: str, so_far: Fit, result: Fit, share: Float[np.ndarray, " frames"]) -> Fit:
-    """A fit that is `so_far` where the share is 0, and the `result` where it is 1."""
-    before, after = (np.asarray(fit.motion.rotations, float) for fit in (so_far, result))
-    rotations, joints = after.copy(), np.flatnonzero((before != after).any(axis=(0, 2))).tolist()
-    for joint in joints:
-        first, last = (Rotation.from_quat(q[:, joint], scalar_first=True) for q in (before, after))
-        turned = Rotation.from_rotvec(share[:, None] * (last * first.inv()).as_rotvec()) * first
-        rotations[:, joint] = turned.as_quat(scalar_first=True)
-    motion = dataclasses.replace(result.motion, rotations=rotations)
-    return put_down(name, result, motion, result.base, result.correction, joints)
-
-
 def _faults(
     over: Float[np.ndarray, "frames rows"], apart: Float[np.ndarray, "frames rows"],
     on_skin: Float[np.ndarray, "looks pairs"],
@@ -448,17 +461,6 @@ def _faults(
     """Share of the frames that show a violation, and of those that lost a touch: what a solve is judged by."""
     shown = (over > TOLERANCE).any(axis=1).mean() + (on_skin > 0.0).any(axis=1).mean()
     return 2.0 * float(shown) + float((apart > 0.0).mean(axis=0).sum())
-
-
-def on_top(so_far: Fit, mine: Correction, at: Sampling) -> Fit:
-    """More controls on top of a fit's motion: those joints whose turns add up with others' get what is missing."""
-    mine = Correction(mine.controls, tuple(np.asarray(p)[: at.whole.count] for p in mine.points))
-    motion = mine.apply(so_far.motion)
-    both = Correction((*so_far.correction.controls, *mine.controls), (*so_far.correction.points, *mine.points))
-    base = dataclasses.replace(so_far.base, root=so_far.motion.root)
-    joints = sorted({int(d.joint) for c in mine.controls for d in c.drives})
-    name = mine.controls[0].name
-    return put_down(name, so_far, motion, base, both, joints)
 
 
 def _told(pairs, excess_before, excess_after, gap_before, gap_after, touching) -> dict:

@@ -18,12 +18,12 @@ from motionfit._programs import program
 from motionfit._skeleton import SIDES
 from motionfit._solve import Block, block_adjoint, block_solver, block_work, solve_block
 from motionfit.adapt._clearance import probe_depths, reduced, support
-from motionfit.adapt._collisions import eased, on_top, sinking_skin
 from motionfit.adapt._controls import Turn, turn_controls
+from motionfit.adapt._easing import eased, sinking_skin
 from motionfit.adapt._groups import Group, filled, known_depths
 from motionfit.adapt._limbs import SOLVE_PROBES, jerk_scale, smooth_floor
 from motionfit.adapt._limits import SkinLooks
-from motionfit.adapt._record import put_down
+from motionfit.adapt._record import on_top, put_down
 from motionfit.adapt._sampling import sampling
 from motionfit.metrics import TOLERANCE, derivative_ratio
 from motionfit.shape.pairs import PAIRS

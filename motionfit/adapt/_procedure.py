@@ -13,7 +13,7 @@ from motionfit._problem import Problem
 from motionfit._programs import make_room
 from motionfit._types import InputError
 from motionfit.adapt._balance import balance
-from motionfit.adapt._collisions import collisions, hands_meet
+from motionfit.adapt._collisions import MEANT, collisions, hands_meet
 from motionfit.adapt._feet import footskate
 from motionfit.adapt._forearm import forearm
 from motionfit.adapt._limbs import LIMBS, limbs
@@ -70,6 +70,7 @@ def adapt(
     adapted = clip.source_on(body) is not clip
     source, clip = (dataclasses.replace(m, source=None) for m in (clip.source_on(body), clip))
     base = onto(clip, character.skeleton)
+    worth = MEANT if blocks is None else None  # by default a hand that misses a hip by a little costs no minute
     if blocks is None:
         blocks = HOLDING if hands_meet(source, reference or character) else DEFAULT
     first, later = (tuple(b for b in some if b in blocks) for some in (LIMBS, LATER))
@@ -88,7 +89,7 @@ def adapt(
     options: dict[str, dict] = {"footskate": {"drift": tuple(blocks) == ("footskate",)}}
     for k, name in enumerate(later, start=bool(first)):
         if name == "collisions":
-            options[name] = {"progress": functools.partial(told, k, name)}
+            options[name] = {"worth": worth, "progress": functools.partial(told, k, name)}
         fit = LATER[name](source, character, fit, reference=reference, **options.get(name, {}))
         told(k, name, 1, 1)
     return dataclasses.replace(fit, motion=dataclasses.replace(fit.motion, source=Source(source, body)))

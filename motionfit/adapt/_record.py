@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from motionfit._control import Control, Correction, Drive
 from motionfit._fit import Fit
 from motionfit._motion import Motion
+from motionfit.adapt._sampling import Sampling
 from motionfit.splines import per_frame
 
 
@@ -43,3 +44,14 @@ def put_down(
     whole = recorded(name, motion, base, correction, joints)
     moved = dataclasses.replace(whole.apply(base), source=so_far.motion.source)
     return dataclasses.replace(so_far, correction=whole, motion=moved, base=base)
+
+
+def on_top(so_far: Fit, mine: Correction, at: Sampling) -> Fit:
+    """More controls on top of a fit's motion: those joints whose turns add up with others' get what is missing."""
+    mine = Correction(mine.controls, tuple(np.asarray(p)[: at.whole.count] for p in mine.points))
+    motion = mine.apply(so_far.motion)
+    both = Correction((*so_far.correction.controls, *mine.controls), (*so_far.correction.points, *mine.points))
+    base = dataclasses.replace(so_far.base, root=so_far.motion.root)
+    joints = sorted({int(d.joint) for c in mine.controls for d in c.drives})
+    name = mine.controls[0].name
+    return put_down(name, so_far, motion, base, both, joints)
