@@ -7,6 +7,8 @@ from scipy.spatial.transform import Rotation
 from motionfit._motion import Motion, bind_pose, host_kinematics
 from motionfit._skeleton import SIDES, Skeleton
 
+# what both skeletons must have
+REQUIRED = ("hips", *(f"{s}_{r}" for s in SIDES for r in ("thigh", "calf", "foot", "upper_arm", "forearm")))
 UP, SIDE = np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])
 
 
@@ -27,9 +29,8 @@ def onto(motion: Motion, skeleton: Skeleton) -> Motion:
         return motion
     if source.is_same(skeleton):
         return Motion(skeleton, motion.root, motion.rotations, motion.dt, motion.translations)
-    required = ("hips", *(f"{s}_{r}" for s in SIDES for r in ("thigh", "calf", "foot", "upper_arm", "forearm")))
-    source.require(*required)
-    skeleton.require(*required)
+    source.require(*REQUIRED)
+    skeleton.require(*REQUIRED)
 
     clip_positions, clip_rest = bind_pose(source)
     positions, bind_quaternions = bind_pose(skeleton)

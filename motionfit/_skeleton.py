@@ -248,7 +248,8 @@ class Skeleton(eqx.Module):
             found = ", ".join(f"{r}={self.names[j]}" for r, j in self.roles) or "none"
             raise InputError(
                 f"no joint found for {', '.join(missing)}; found {found}; joints: {', '.join(self.names)}; "
-                'name them in a role mapping file {"' + missing[0] + '": "JointName"}'
+                'name them in a JSON file {"' + missing[0] + '": "JointName", ...}: --roles FILE for a clip, '
+                "--character-roles FILE for a character, roles= in Python"
             )
 
     def chain(self, kind: str) -> tuple[int, ...]:

@@ -18,11 +18,18 @@ import typer
 if TYPE_CHECKING:
     from motionfit._fit import BlockReport
     from motionfit._motion import Motion
+    from motionfit._skeleton import Skeleton
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False,
                   help="Adapt motion clips to the shape of a character.")  # fmt: skip
 
 ClipArgument = Annotated[str, typer.Argument(help="clip: .bvh, .glb, .gltf, .npz, or builtin:walk")]
+ClipRoles = Annotated[
+    pathlib.Path | None, typer.Option("--roles", help="JSON file that names the joints of an unknown clip by role")
+]
+CharacterRoles = Annotated[
+    pathlib.Path | None, typer.Option(help="the same for a character, and for a --reference that is a file")
+]
 CharacterArgument = Annotated[str, typer.Argument(help="character: .glb, .gltf, or builtin:average|slim|heavy|child")]
 
 
@@ -67,13 +74,15 @@ def adapt(
     end: Annotated[float | None, typer.Option(help="cut the clip up to here [s]")] = None,
     unit: Annotated[float | None, typer.Option(help="metres per unit of a BVH file, where the guess is wrong")] = None,
     up: Annotated[str | None, typer.Option(help="up axis of a BVH file, y or z, where the guess is wrong")] = None,
-    roles: Annotated[pathlib.Path | None, typer.Option(help="JSON role mapping for unknown joint names")] = None,
+    roles: ClipRoles = None,
+    character_roles: CharacterRoles = None,
     report: Annotated[pathlib.Path | None, typer.Option(help="write report.json here")] = None,
     plot: Annotated[pathlib.Path | None, typer.Option(help="write report.png here")] = None,
 ) -> None:
     """Adapt CLIP to the shape of CHARACTER."""
     run_adapt(clip, character, girth=girth, reference=reference, blocks=blocks, objective=objective, fps=fps,
-              start=start, end=end, unit=unit, up=up, roles=roles, out=out, report=report, plot=plot)  # fmt: skip
+              start=start, end=end, unit=unit, up=up, roles=roles, character_roles=character_roles,
+              out=out, report=report, plot=plot)  # fmt: skip
 
 
 @app.command()
@@ -84,18 +93,20 @@ def metrics(
         str | None, typer.Option(help="the source clip that fidelity is against; a file of `adapt` may hold it")
     ] = None,
     reference: Annotated[str | None, typer.Option(help="the body that the clip was made for")] = None,
+    roles: ClipRoles = None,
+    character_roles: CharacterRoles = None,
     json_file: Annotated[pathlib.Path | None, typer.Option("--json", help="write the measures here")] = None,
 ) -> None:
     """Measure CLIP on CHARACTER: penetration on volumes and skin, feet, balance, fidelity, smoothness."""
     import motionfit as mf
     from motionfit._progress import progress_bar
 
-    body, motion = mf.load_character(character), _load_clip(clip)
-    source = motion.source_on(body.fingerprint) if reference_clip is None else _load_clip(reference_clip)
+    body, motion = _load_body(character, character_roles), _load_clip(clip, roles=roles)
+    source = motion.source_on(body.fingerprint) if reference_clip is None else _load_clip(reference_clip, roles=roles)
     if source.frame_count != motion.frame_count:
         raise mf.InputError(f"{reference_clip} has {source.frame_count} frames, {clip} has {motion.frame_count}; give "
                             "the clip that it was made from, cut and resampled alike")  # fmt: skip
-    other = None if reference is None else mf.load_character(reference)
+    other = None if reference is None else _load_body(reference, character_roles)
     if other is not None and source is motion:
         sys.stderr.write(f"motionfit: {reference} plays {clip} itself; if that is an adapted clip, add "
                          "--reference-clip and the clip that it was made from, or what it was adapted away from "
@@ -132,6 +143,8 @@ def footskate(
     report: Annotated[pathlib.Path | None, typer.Option(help="write report.json here")] = None,
     plot: Annotated[pathlib.Path | None, typer.Option(help="draw the footprints before and after here")] = None,
     save_labels: Annotated[pathlib.Path | None, typer.Option(help="write the footplants that were used here")] = None,
+    roles: ClipRoles = None,
+    character_roles: CharacterRoles = None,
 ) -> None:
     """Make the planted feet of CLIP on CHARACTER hold still."""
     import numpy as np
@@ -144,7 +157,7 @@ def footskate(
         if target is not None and not target.parent.is_dir():
             raise mf.InputError(f"{target}: its folder does not exist; make it first: mkdir -p {target.parent}")
     started = time.perf_counter()
-    motion, body = _load_clip(clip), mf.load_character(character)
+    motion, body = _load_clip(clip, roles=roles), _load_body(character, character_roles)
     loaded = time.perf_counter() - started
     found = mf.remove_footskate(motion, body, method, labels=labels, floor=floor)
     solved = time.perf_counter() - started - loaded
@@ -184,7 +197,7 @@ def run_adapt(
     clip: str, character: str, *, out: pathlib.Path, girth: str | None = None, reference: str | None = None,
     blocks: str | None = None, objective: str = "vertex", fps: float | None = None, start: float | None = None,
     end: float | None = None, unit: float | None = None, up: str | None = None, roles: pathlib.Path | None = None,
-    report: pathlib.Path | None = None, plot: pathlib.Path | None = None,
+    character_roles: pathlib.Path | None = None, report: pathlib.Path | None = None, plot: pathlib.Path | None = None,
 ) -> None:  # fmt: skip
     """Load, adapt, measure and write; leaves with status 3 where a violation is left."""
     import jax
@@ -207,8 +220,8 @@ def run_adapt(
     scales = parse_girth(girth) if girth else {}
     started = time.perf_counter()
     motion = _load_clip(clip, unit=unit, up=up, roles=roles, start=start, end=end, fps=fps)
-    body = mf.load_character(character)
-    other = mf.load_character(reference) if reference else (body if scales else None)
+    body = _load_body(character, character_roles)
+    other = _load_body(reference, character_roles) if reference else (body if scales else None)
     if scales:
         body = grow(body, scales)
     base = mf.onto(motion, body.skeleton)
@@ -274,11 +287,32 @@ def _load_clip(clip: str, *, start=None, end=None, fps=None, **options):
     from motionfit.samples import CLIPS
 
     if not clip.startswith("builtin:"):
-        return mf.load_motion(clip, start=start, end=end, fps=fps, **options)
+        motion = mf.load_motion(clip, start=start, end=end, fps=fps, **options)
+        _has_roles(clip, motion.skeleton)
+        return motion
     if (name := clip.removeprefix("builtin:")) not in CLIPS:
         known = ", ".join(f"builtin:{k}" for k in CLIPS)
         raise mf.InputError(f"{clip}: no such built-in clip; there are {known}")
     return trim(CLIPS[name](), start=start, end=end, fps=fps, name=clip)
+
+
+def _load_body(character: str, roles: pathlib.Path | None):
+    """A character from a file, or a built-in one."""
+    import motionfit as mf
+
+    body = mf.load_character(character, roles=None if character.startswith("builtin:") else roles)
+    _has_roles(character, body.skeleton)
+    return body
+
+
+def _has_roles(file: str, skeleton: "Skeleton") -> None:
+    from motionfit._onto import REQUIRED
+    from motionfit._types import InputError
+
+    try:
+        skeleton.require(*REQUIRED)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
 
 
 class _CompileClock:

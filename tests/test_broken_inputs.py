@@ -1,5 +1,6 @@
 """Broken inputs: each gets one line on stderr that says what and where, exit status 2, and no output file."""
 
+import dataclasses
 import json
 import pathlib
 import sys
@@ -201,6 +202,28 @@ def test_truncated_glb(monkeypatch, capsys, tmp_path):
 def test_a_skeleton_without_the_roles_is_told_what_was_found(monkeypatch, capsys, tmp_path):
     (tmp_path / "clip.bvh").write_text(BVH)
     _refused(monkeypatch, capsys, tmp_path, tmp_path / "clip.bvh", "builtin:average", "found chest=Spine, hips=Hips")
+
+
+def test_a_character_of_unknown_joints_is_named_and_its_roles_can_be_given(monkeypatch, capsys, tmp_path):
+    from motionfit._skeleton import Skeleton
+
+    body, walk = mf.load_character("builtin:child"), samples.walk(cycles=1)[:8]
+    known = body.skeleton
+    names = tuple(f"bone_{k}" for k in range(len(known.names)))
+    nameless = Skeleton(names, known.parents, known.offsets, known.rest_rotations)
+    clip = mf.onto(walk, known)
+    mf.save(tmp_path / "body.glb", dataclasses.replace(clip, skeleton=nameless), mf.Character(nameless, body.skin, "x"))
+    fact = "body.glb: no joint found for hips"
+    _refused(monkeypatch, capsys, tmp_path, "builtin:walk", tmp_path / "body.glb", fact)
+    _refused(monkeypatch, capsys, tmp_path, "builtin:walk", tmp_path / "body.glb", "--character-roles FILE")
+    (tmp_path / "roles.json").write_text(json.dumps({role: names[joint] for role, joint in known.roles}))
+    mf.save(tmp_path / "clip.bvh", walk)
+    code, said = _run(monkeypatch, capsys, "metrics", tmp_path / "clip.bvh", tmp_path / "body.glb",
+                      "--character-roles", tmp_path / "roles.json", "--json", tmp_path / "m.json")  # fmt: skip
+    assert code == 0, said
+    measured = json.loads((tmp_path / "m.json").read_text())
+    expected = mf.metrics.skin_depths(body, clip, step=4).depth.max()
+    assert measured["penetration"]["skin"]["excess_max_m"] == pytest.approx(expected, abs=1e-4)
 
 
 @pytest.mark.parametrize("name", ["clip.bvh", "clip.glb", "clip.npz", "correction.npz", "plants.csv", "look.png"])

@@ -17,7 +17,7 @@ from motionfit._control import Correction
 from motionfit._motion import Motion, host_kinematics, joint_angles, rest_motion
 from motionfit._solve import block_adjoint, block_solver, block_work, solve_block
 from motionfit.adapt import Group, Sphere, Turn, multi_start
-from motionfit.adapt._collisions import ROUNDS, Attempt, _windows, hands_meet, without_arms
+from motionfit.adapt._collisions import ROUNDS, Attempt, Outcome, _windows, hands_meet, without_arms
 from motionfit.adapt._controls import turn_controls
 from motionfit.adapt._easing import between, eased, sinking_skin
 from motionfit.adapt._groups import GROUPS, MOST, PROBES, Meetings, arm_turns, known_depths
@@ -97,7 +97,7 @@ def test_what_sinks_in_where_it_is_taken_up_is_solved_in_more_frames_and_then_le
         lengths.append(len(asked.at.frames))
         controls = turn_controls(asked.so_far.motion, asked.at.whole, [out])
         inwards = Correction(controls, (np.full(asked.at.basis.count, -0.35),))
-        return on_top(asked.so_far, inwards, asked.at), False, ()
+        return Outcome(on_top(asked.so_far, inwards, asked.at), False, ())
 
     monkeypatch.setattr("motionfit.adapt._collisions._best", into_the_thigh)
     fit = mf.adapt.collisions(base, average, _as_fit(bad, base, average), groups=(group,))

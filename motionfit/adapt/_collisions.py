@@ -175,6 +175,14 @@ class Wrong(NamedTuple):
         return SkinLooks(self.clip[asked.at.frames[seen]], asked.character, self.reference, PAIRS)
 
 
+class Outcome(NamedTuple):
+    """What the solves of a window found (None: nothing better), whether its skin shows too much, and what they did."""
+
+    fit: Fit | None
+    shows: bool
+    history: tuple[BlockReport, ...]
+
+
 def _run_by_run(
     asked: Asked, wrong: Wrong, spacing: float, tell: Callable[[float], None]
 ) -> tuple[Fit, tuple[BlockReport, ...], bool]:
@@ -182,38 +190,43 @@ def _run_by_run(
     what is taken of them shows too much. Where an arm sinks in on its way from one motion to the other and back, the
     run gets longer, and in the end it is let be."""
     beside, seen = round(BESIDE / asked.at.dt), len(wrong.somewhere)
-    windows, known, rounds = _windows(wrong.somewhere, beside), {}, 0
+    windows, rounds = _windows(wrong.somewhere, beside), 0
+    solved: dict[tuple[int, int], Outcome] = {}
 
     def told_round() -> None:
         nonlocal rounds
         rounds += 1
         tell(min(rounds / (ROUNDS * len(windows)), 1.0))
 
+    def put_in(some: list[slice]) -> tuple[Fit, list[slice], list[slice]]:
+        """The fit with what was found in some windows, those in which anything was, and those whose ends sink in."""
+        found = {(w.start, w.stop): part for w in some if (part := solved[w.start, w.stop].fit) is not None}
+        some = [w for w in some if (w.start, w.stop) in found]
+        result = _put_in(asked, list(found.values()), some)
+        return result, some, [w for w in some if _ends_sink(asked, wrong, result, w)]
+
     for widened in range(WIDENED + 1):
         if sum(w.stop - w.start for w in windows) > MUCH * seen:
             windows = [slice(0, seen)]
         least = max((w.stop - w.start for w in windows), default=0)
         for w in windows:
-            if (w.start, w.stop) not in known:
+            if (w.start, w.stop) not in solved:
                 faults = _faults(wrong.worst[w], wrong.apart[w], np.zeros((1, 1)))
-                lost = bool((wrong.apart[w] > 0.0).any())
-                known[w.start, w.stop] = _best(asked.part(w, spacing, least), faults, lost, wrong.looks(asked, w), told_round)  # fmt: skip
-        taken = [w for w in windows if known[w.start, w.stop][0] is not None]
-        result = _put_in(asked, [known[w.start, w.stop][0] for w in taken], taken)
-        sinking = [w for w in taken if _ends_sink(asked, wrong, result, w)]
+                part, lost = asked.part(w, spacing, least), bool((wrong.apart[w] > 0.0).any())
+                solved[w.start, w.stop] = _best(part, faults, lost, wrong.looks(asked, w), told_round)
+        result, taken, sinking = put_in(windows)
         if not sinking:
             break
         if widened == WIDENED:
-            taken = [w for w in taken if w not in sinking]
-            result = _put_in(asked, [known[w.start, w.stop][0] for w in taken], taken)
+            result, taken, _ = put_in([w for w in taken if w not in sinking])
             break
         around = np.zeros(seen, bool)
         for w in windows:
             more = beside if w in sinking else 0
             around[max(w.start - more, 0) : w.stop + more] = True
         windows = _windows(around, 0)
-    history = tuple(report for _, _, more in known.values() for report in more)
-    return result, history, any(known[w.start, w.stop][1] for w in taken)
+    history = tuple(report for one in solved.values() for report in one.history)
+    return result, history, any(solved[w.start, w.stop].shows for w in taken)
 
 
 def _ends_sink(asked: Asked, wrong: Wrong, result: Fit, seen: slice) -> bool:
@@ -243,9 +256,9 @@ def _windows(wrong: Bool[np.ndarray, " seen"], beside: int) -> list[slice]:
 
 def _best(
     asked: Asked, faults: float, lost: bool, looks: SkinLooks, tell: Callable[[], None]
-) -> tuple[Fit | None, bool, tuple[BlockReport, ...]]:  # fmt: skip
-    """The best fit that some rounds find (None: none is better), whether its skin shows too much, and what the solves
-    did. What makes matters worse is let be, as is a touch that cannot be had without sinking in elsewhere."""
+) -> Outcome:  # fmt: skip
+    """The best fit that some rounds find. What makes matters worse is let be, as is a touch that cannot be had without
+    sinking in elsewhere."""
     best = Attempt(asked, asked.so_far, looks)
     best.go_on(TRIAL, tell)
     if not best.done and best.faults > WELL and lost:
@@ -257,14 +270,14 @@ def _best(
     if best.look_between():
         best.go_on(best.rounds + PATIENCE, tell)
     if best.result is None or best.faults >= faults:
-        return None, False, best.history
+        return Outcome(None, False, best.history)
     result, shown = best.result, best.judged(best.result)
     sunk = sinking_skin(best.looks, asked.small, asked.at)
     less = eased("collisions_eased", asked.so_far, result, asked.at, sunk)
     if less is not result:
         # single frames that sink in are not worth a touch that lasts
         shown, result = min((best.judged(less), less), (shown, result), key=lambda tried: tried[0].faults)
-    return result, bool(shown.on_skin.max() > (1.0 - NEARLY) * TOLERANCE), best.history
+    return Outcome(result, bool(shown.on_skin.max() > (1.0 - NEARLY) * TOLERANCE), best.history)
 
 
 def _put_in(asked: Asked, parts: list[Fit], windows: list[slice]) -> Fit:
