@@ -193,7 +193,8 @@ def test_arms_led_too_far_to_come_back_begin_again_without_it(sunk, average):
     source = sunk[1]
     out = Turn("arm_out", (("left_upper_arm", "forward", 1.0),), 0.5)
     at = sampling(source, 2 / 60)
-    led = Correction(turn_controls(source, at.whole, [out]), (np.full(at.basis.count, 1.2),))
+    far = turn_controls(source, at.whole, [Turn("far_out", out.drives)])  # to a right angle
+    led = Correction(far, (np.full(at.basis.count, 1.2),))
     so_far = on_top(_as_fit(source, source, average), led, at)
     group = Group("hand/thigh", ("left_hand",), ("left_thigh",), (out,))
     left = mf.adapt.collisions(source, average, so_far, reference=average, groups=(group,), worth=())
