@@ -27,9 +27,7 @@ ClipArgument = Annotated[str, typer.Argument(help="clip: .bvh, .glb, .gltf, .npz
 ClipRoles = Annotated[
     pathlib.Path | None, typer.Option("--roles", help="JSON file that names the joints of an unknown clip by role")
 ]
-CharacterRoles = Annotated[
-    pathlib.Path | None, typer.Option(help="the same for a character, and for a --reference that is a file")
-]
+CharacterRoles = Annotated[pathlib.Path | None, typer.Option(help="the same for characters that are files")]
 CharacterArgument = Annotated[str, typer.Argument(help="character: .glb, .gltf, or builtin:average|slim|heavy|child")]
 
 
