@@ -1,12 +1,12 @@
 """A character: a skeleton with a skin. Its invariants are checked here, once."""
 
 import hashlib
-from functools import cached_property
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Int
 
+from motionfit._remembered import Remembering, remembered
 from motionfit._skeleton import SIDES, Skeleton
 from motionfit._skinning import Skin
 from motionfit._types import InputError
@@ -30,7 +30,7 @@ def part_of_joint(skeleton: Skeleton, joint: int) -> str:
     return "head" if role.startswith("neck_") else PART_OF_ROLE[role]
 
 
-class Character(eqx.Module):
+class Character(eqx.Module, Remembering):
     """Skeleton + Skin, with the roles that the adaptation needs.
 
     `name` is what reports call it. Body volumes are fitted to it by `motionfit.shape`.
@@ -47,17 +47,17 @@ class Character(eqx.Module):
             if used.size and (used.min() < 0 or used.max() >= joints):
                 raise InputError(f"{self.name}: the skin names joint {int(used.max())}, but there are {joints}")
 
-    @cached_property
+    @remembered
     def memo(self) -> dict:
         """What was fitted once to this very character on the host."""
         return {}
 
-    @cached_property
+    @remembered
     def fingerprint(self) -> str:
         """Tells bodies apart by their skin in the bind pose, in single precision, as files hold it."""
         return hashlib.sha256(np.asarray(self.skin.vertices_bind, np.float32).tobytes()).hexdigest()[:16]
 
-    @cached_property
+    @remembered
     def part_of_vertex(self) -> Int[np.ndarray, " vertices"]:
         """Index into `PARTS` of each vertex, by its joint of greatest weight."""
         of_joint = np.array([PARTS.index(part_of_joint(self.skeleton, j)) for j in range(len(self.skeleton.names))])

@@ -5,12 +5,12 @@ import os
 import pathlib
 import re
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from motionfit._remembered import Remembering, remembered
 from motionfit._types import AnyArray, InputError
 
 # A role is what a joint *does*. The spine, the neck and nothing else are chains: `spine_0` is the lowest joint
@@ -166,7 +166,7 @@ def load_role_mapping(path: str | os.PathLike) -> dict[str, str]:
     return mapping
 
 
-class Skeleton(eqx.Module):
+class Skeleton(eqx.Module, Remembering):
     """Joints in an order in which a parent stands before its children.
 
     `offsets` are joint positions in the parent's frame at bind [m]; that of the root is its bind position in the
@@ -217,17 +217,17 @@ class Skeleton(eqx.Module):
             if hasattr(array, "shape") and array.shape != shape:
                 raise InputError(f"skeleton {name} has shape {array.shape}, expected {shape}")
 
-    @cached_property
+    @remembered
     def memo(self) -> dict:
         """What was computed once from this very skeleton on the host."""
         return {}
 
-    @cached_property
+    @remembered
     def role_of_joint(self) -> dict[int, str]:
         """Joint index -> role, for the joints that have one."""
         return {joint: role for role, joint in self.roles}
 
-    @cached_property
+    @remembered
     def _joint_of_role(self) -> dict[str, int]:
         return dict(self.roles)
 
@@ -257,7 +257,7 @@ class Skeleton(eqx.Module):
         joints = [j for r, j in self.roles if re.fullmatch(rf"{kind}_\d+", r) or (kind, r) == ("spine", "chest")]
         return tuple(sorted(joints))
 
-    @cached_property
+    @remembered
     def levels(self) -> tuple[tuple[int, ...], ...]:
         """Joints by depth: level 0 is the root. Forward kinematics goes level by level."""
         depths = [_depth(self.parents, j) for j in range(len(self.names))]

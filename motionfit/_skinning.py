@@ -1,7 +1,5 @@
 """Linear blend skinning: thesis (4.20)."""
 
-from functools import cached_property
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -10,10 +8,11 @@ from jaxtyping import Float, Int
 
 from motionfit import rotation
 from motionfit._motion import Kinematics
+from motionfit._remembered import Remembering, remembered
 from motionfit._types import AnyArray, Faces, InputError, Vertices
 
 
-class Skin(eqx.Module):
+class Skin(eqx.Module, Remembering):
     """The mesh in its bind pose and which joints move each vertex.
 
     `vertices_bind` [m], triangles `faces`, and per vertex up to `influences` joints with weights that sum to one
@@ -54,7 +53,7 @@ class Skin(eqx.Module):
     def normals_bind(self) -> Vertices:
         return vertex_normals(self.vertices_bind, self.faces)
 
-    @cached_property
+    @remembered
     def main_joint(self) -> Int[np.ndarray, " vertices"]:
         """The joint of greatest weight of each vertex: thesis (4.2)."""
         joints, weights = np.asarray(self.joints), np.asarray(self.weights)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from motionfit._character import Character
@@ -28,7 +28,7 @@ from motionfit.adapt._limbs import jerk_scale
 from motionfit.adapt._limits import NEARLY, SkinLooks
 from motionfit.adapt._record import on_top, put_down
 from motionfit.adapt._sampling import Sampling, sampling
-from motionfit.metrics import TOLERANCE, skin_gaps
+from motionfit.metrics import TOLERANCE, skin_depths, skin_gaps
 from motionfit.shape.pairs import PAIRS, Pair
 from motionfit.terms.pose import Effort, Smoothness
 
@@ -151,14 +151,20 @@ def _solve(
     gap_before = asked.gaps(small, before)
     apart, worst = np.where(touching, gap_before - TOUCH, 0.0), np.where(inner, 0.0, before - limit)
     asked_for = np.array([worth is None or p[:2] in {w[:2] for w in worth} for p in pairs])
-    wrong = np.maximum(worst - TOLERANCE, np.where(asked_for, apart, 0.0)).max(axis=1) > 0.0
-    result, history, left = _run_by_run(asked, Wrong(clip, reference, worst, apart, wrong), spacing, tell)
+    somewhere = np.maximum(worst - TOLERANCE, np.where(asked_for, apart, 0.0)).max(axis=1) > 0.0
+    wrong = Wrong(clip, reference, worst, apart, somewhere)
+    if so_far.status == "violations_left":
+        somewhere[wrong.on_skin(asked, small)] = True
+    result, history, left = _run_by_run(asked, wrong, spacing, tell)
     moved = at.motion(result.motion)
     after = known.depths(moved)
     told = _told(pairs, before - limit, after - limit, gap_before, asked.gaps(moved, after), touching)
-    left = left or np.where(inner, 0.0, after - limit).max() > TOLERANCE
-    return dataclasses.replace(result, history=(*so_far.history, *history),
-                               status="violations_left" if left else so_far.status), told  # fmt: skip
+    left = left or wrong.shown(asked, moved, np.where(inner, 0.0, after - limit) > TOLERANCE)
+    status = "violations_left" if left else so_far.status
+    if not left and status == "violations_left" and "balance" not in so_far.details:
+        # what the arm and leg blocks had left may be gone
+        status = "violations_left" if len(wrong.on_skin(asked, moved)) else "converged"
+    return dataclasses.replace(result, history=(*so_far.history, *history), status=status), told
 
 
 class Wrong(NamedTuple):
@@ -173,6 +179,25 @@ class Wrong(NamedTuple):
     def looks(self, asked: Asked, seen: slice | np.ndarray) -> SkinLooks:
         """Looks at the skin in some of the frames that are seen."""
         return SkinLooks(self.clip[asked.at.frames[seen]], asked.character, self.reference, PAIRS)
+
+    def on_skin(self, asked: Asked, small: Motion) -> Int[np.ndarray, " some"]:
+        """The frames that are seen in which arms and legs show more than the tolerance on the skin."""
+        looks = self.looks(asked, slice(None))
+        looks.look_between(small)
+        return looks.at[(looks.depths(small) - looks.own > TOLERANCE).any(axis=1)]
+
+    def shown(self, asked: Asked, small: Motion, over: Bool[np.ndarray, "frames rows"]) -> bool:
+        """Whether the skin shows what the fields say is `over` the tolerance; spheres have none."""
+        rows = np.flatnonzero(over.any(axis=0) & asked.known.on_skin)
+        frames = np.flatnonzero(over[:, rows].any(axis=1))
+        if over[:, ~asked.known.on_skin].any() or not len(frames):
+            return bool(over[:, ~asked.known.on_skin].any())
+        pairs = tuple(asked.known.clearance.pairs[row] for row in rows)
+        body = self.reference or asked.character
+        played = asked.so_far.base if self.reference is None else onto(self.clip, body.skeleton)
+        own, now = (skin_depths(b, m[frames], pairs).depth
+                    for b, m in ((body, asked.at.motion(played)), (asked.character, small)))  # fmt: skip
+        return bool(((now - own > TOLERANCE) & over[np.ix_(frames, rows)]).any())
 
 
 class Outcome(NamedTuple):

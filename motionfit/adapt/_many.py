@@ -95,8 +95,7 @@ def _at_once(
         while True:
             # the first alone: it compiles for all
             for body in islice(waiting, (AHEAD * workers if done else 1) - len(running)):
-                bare = jax.tree.map(lambda x: x, body)  # without what was fitted to it
-                running.append(pool.submit(_run, bare, last))
+                running.append(pool.submit(_run, body, last))
             if not running:
                 return
             last, done = running.popleft().result(), done + 1
