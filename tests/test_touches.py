@@ -87,10 +87,10 @@ def test_touches_on_another_body_are_those_of_the_same_vertices(heavy, clip):
     real = np.asarray(term.allowed) < NEVER
     turns, shifts = mf.forward_kinematics(body.skeleton, moved).skin_transforms()
     moves = np.concatenate([np.asarray(turns), np.asarray(shifts)[..., None]], axis=-1)
-    told = np.einsum("tjab,tnjb->tna", moves, touching_on(term, body).blend)
+    told = np.swapaxes(np.moveaxis(moves, 2, 1).reshape(len(moves), 3, -1) @ touching_on(term, body).blend, 1, 2)
     np.testing.assert_allclose(told[real], ways_on(body, moved, term)[real], atol=1e-6)
-    itself = np.asarray(touching_on(term, heavy).blend)
-    np.testing.assert_allclose(itself[real], np.asarray(term.blend)[real], atol=1e-12)
+    itself, blend = (np.swapaxes(np.asarray(t.blend), 1, 2) for t in (touching_on(term, heavy), term))
+    np.testing.assert_allclose(itself[real], blend[real], atol=1e-12)
 
 
 def test_touches_give_way_where_the_skin_is_out_too_far():

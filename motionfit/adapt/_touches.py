@@ -97,7 +97,7 @@ def touch_term(
     found = [np.column_stack([np.full(len(t.pairs), frame), t.pairs, t.vertices, t.corners])
              for frame, t in zip(at.tolist(), kept, strict=True)]  # fmt: skip
     normals, carried_by, shares = (by_frame([getattr(t, k) for t in kept]) for k in ("normals", "carried_by", "shares"))
-    return TouchClearance(by_frame(blend), normals, carried_by, limits, by_frame(found), shares)
+    return TouchClearance(laid_out(by_frame(blend)), normals, carried_by, limits, by_frame(found), shares)
 
 
 def ways(
@@ -115,11 +115,17 @@ def ways(
     return result
 
 
+def laid_out(blend: Float[np.ndarray, "frames touches joints 4"]) -> Float[np.ndarray, "frames 4*joints touches"]:
+    """Ways as `TouchClearance` has them."""
+    return np.ascontiguousarray(np.swapaxes(blend.reshape(*blend.shape[:2], -1), 1, 2))
+
+
 def touching_on(term: TouchClearance, character: Character) -> TouchClearance:
     """The same touches on a body of the same topology."""
     found = np.asarray(term.found).reshape(-1, 6)
     blend = ways(character, found[:, 2], found[:, 3:], np.asarray(term.shares).reshape(-1, 3))
-    return eqx.tree_at(lambda t: t.blend, term, blend.reshape(np.shape(term.blend)))
+    frames, _, touches = np.shape(term.blend)
+    return eqx.tree_at(lambda t: t.blend, term, laid_out(blend.reshape(frames, touches, -1, 4)))
 
 
 def _deepest(

@@ -125,7 +125,8 @@ class TouchClearance(Term):
 
     These are the contacts of rigid-body dynamics, found on the posed skin and linearised: the depth of a touch is the
     way from the vertex to its place, along the surface's normal there. `blend` holds that way as a sum over the
-    joints, skin weight times bind-pose position (homogeneous), so that (4.20) is one product; the `normals` turn with
+    joints, skin weight times bind-pose position (homogeneous, four rows per joint), so that (4.20) is one product, and
+    laid out so that it is a fast one; the `normals` turn with
     the joints `carried_by`. Exact in the pose in which it was found, where a field of one pose is not, and of first
     order around it. `allowed` [m] is the depth that does not count, per frame and touch; `sigma` [m].
 
@@ -133,7 +134,7 @@ class TouchClearance(Term):
     and the corners of the triangle that it is nearest to, with their `shares` in the place.
     """
 
-    blend: Float[AnyArray, "frames touches joints 4"]
+    blend: Float[AnyArray, "frames 4*joints touches"]
     normals: Float[AnyArray, "frames touches 3"]
     carried_by: Int[AnyArray, "frames touches"]
     allowed: Float[AnyArray, "frames touches"]
@@ -145,10 +146,10 @@ class TouchClearance(Term):
     def depth(self, kin: Kinematics) -> Float[Array, "frames touches"]:
         """Depth [m] of every touch; negative where there is a gap."""
         turns, shifts = kin.skin_transforms()
-        moves = jnp.concatenate([turns, shifts[..., None]], axis=-1)
-        ways = jnp.einsum("tjab,tnjb->tna", moves, jnp.asarray(self.blend, moves.dtype))
+        rows = jnp.moveaxis(jnp.concatenate([turns, shifts[..., None]], axis=-1), 2, 1).reshape(len(turns), 3, -1)
+        ways = jnp.swapaxes(rows @ jnp.asarray(self.blend, rows.dtype), 1, 2)
         carried = jnp.take_along_axis(turns, jnp.asarray(self.carried_by)[..., None, None], axis=1)
-        normals = rotation.matrix_times(carried, jnp.asarray(self.normals, moves.dtype))
+        normals = rotation.matrix_times(carried, jnp.asarray(self.normals, rows.dtype))
         return jnp.sum(normals * ways, axis=-1)
 
     def residual(self, kin: Kinematics) -> Float[Array, "frames touches"]:
