@@ -115,7 +115,7 @@ def ways(
     return result
 
 
-def laid_out(blend: Float[np.ndarray, "frames touches joints 4"]) -> Float[np.ndarray, "frames 4*joints touches"]:
+def laid_out(blend: Float[np.ndarray, "frames touches joints 4"]) -> Float[np.ndarray, "frames four_joints touches"]:
     """Ways as `TouchClearance` has them."""
     return np.ascontiguousarray(np.swapaxes(blend.reshape(*blend.shape[:2], -1), 1, 2))
 

@@ -134,7 +134,7 @@ class TouchClearance(Term):
     and the corners of the triangle that it is nearest to, with their `shares` in the place.
     """
 
-    blend: Float[AnyArray, "frames 4*joints touches"]
+    blend: Float[AnyArray, "frames four_joints touches"]
     normals: Float[AnyArray, "frames touches 3"]
     carried_by: Int[AnyArray, "frames touches"]
     allowed: Float[AnyArray, "frames touches"]
