@@ -4,7 +4,8 @@ Penetration is judged twice: on fitted volumes, and on the skinned mesh itself b
 (Jacobson et al. 2013; Barill et al. 2018, through libigl), so that volumes are never judged by volumes alone.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from motionfit.shape.pairs import PAIRS, Pair
 from motionfit.shape.surface import Inside, find_inside, inside_depths, part_surface, surface_gap
 
 TOLERANCE = 0.01  # [m]: the "1 cm" of every frames_over_1cm
+SHOWN_KEPT = 100_000  # poses of which it is known what they show: some 40 MB
 
 
 # --- penetration -----------------------------------------------------------------------------------------------
@@ -59,16 +61,47 @@ def skin_depths(
     itself. `step` looks at every step-th frame only.
     """
     frames = np.arange(0, motion.frame_count, step)
-    result, inside = np.zeros((len(frames), len(pairs))), 0
-    for i, _, found in insides(character, motion[frames], pairs):
-        for (k, *_), points in found.items():
-            if len(points.depth):
-                result[i, k] = max(result[i, k], points.depth.max())
-                inside += int((points.depth > 0.0).sum())  # not what lies on the border of both
+    looked, known = motion[frames], shown_before(character, pairs)
+    poses = poses_of(looked)
+    new = list({pose: i for i, pose in enumerate(poses) if pose not in known}.values())
+    for i, (_, _, found) in enumerate(insides(character, looked[np.array(new, int)], pairs), 1):
+        known[poses[new[i - 1]]] = shown_in(found, len(pairs))
         if progress is not None:
-            progress(i + 1, len(frames))
+            progress(i, len(new))
+    result = np.array([known[pose].depth for pose in poses]).reshape(len(frames), len(pairs))
     probed = max(sum(len(v) for v in _probed(character, pairs).values()), 1)
-    return SkinDepths(result, inside / (probed * max(len(frames), 1)), frames)
+    return SkinDepths(result, sum(known[pose].inside for pose in poses) / (probed * max(len(frames), 1)), frames)
+
+
+class Shown(NamedTuple):
+    """What the skin shows in one pose: per pair the depth [m], and how many vertices are inside."""
+
+    depth: Float[np.ndarray, " pairs"]
+    inside: int
+
+
+def shown_before(character: Character, pairs: Sequence[Pair]) -> dict[bytes, Shown]:
+    """What was seen on a body before, by pose: a look takes ten milliseconds or more, so none is taken twice."""
+    known = character.memo.setdefault(("shown", tuple(pairs)), {})
+    if len(known) > SHOWN_KEPT:
+        known.clear()
+    return known
+
+
+def shown_in(found: Mapping["Direction", Inside], pairs: int) -> Shown:
+    """What a look found, as numbers."""
+    depth, inside = np.zeros(pairs), 0
+    for (pair, *_), points in found.items():
+        depth[pair] = max(depth[pair], points.depth.max(initial=0.0))
+        inside += int((points.depth > 0.0).sum())  # not what lies on the border of both
+    return Shown(depth, inside)
+
+
+def poses_of(motion: Motion) -> list[bytes]:
+    """What tells frames apart by what their skin shows: where a body stands does not matter."""
+    arrays = [motion.rotations, *(() if motion.translations is None else (motion.translations,))]
+    rows = [np.ascontiguousarray(np.asarray(x)).reshape(motion.frame_count, -1) for x in arrays]
+    return [hashlib.sha256(b"".join(r[t].tobytes() for r in rows)).digest() for t in range(motion.frame_count)]
 
 
 Direction = tuple[int, str, str]  # which pair, the part whose vertices are tested, the part whose surface it is

@@ -148,14 +148,17 @@ def test_no_pose_is_looked_at_twice(heavy, average, clip, monkeypatch):
 
     for module in ("motionfit.adapt._limits", "motionfit.metrics"):
         monkeypatch.setattr(f"{module}.insides", counting)
-    average.memo.pop(("shown", PAIRS), None)
+    for body in (average, heavy):
+        body.memo.pop(("shown", PAIRS), None)
     looks = SkinLooks(clip, heavy, average, PAIRS)
     count = len(looks.at)
     assert looked == [average.name] * count
     first, posed = looks.depths(clip), looks.depths_and_touches(clip)
     np.testing.assert_array_equal(first, posed)
     np.testing.assert_array_equal(first, skin_depths(heavy, clip[looks.at], PAIRS).depth)
-    assert looked[count:] == [heavy.name] * count * 2  # ours, and the one to compare with
+    elsewhere = dataclasses.replace(clip, root=np.asarray(clip.root) + [3.0, 0.0, 1.0])
+    np.testing.assert_array_equal(first, skin_depths(heavy, elsewhere[looks.at], PAIRS).depth)
+    assert looked[count:] == [heavy.name] * count
     # one frame moves: it alone is looked at, and what touches in the others is not told twice
     told = {frame: len(touches.pairs) for frame, touches in looks.touches.items()}
     assert max(told.values()) > 0

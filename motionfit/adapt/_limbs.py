@@ -61,6 +61,7 @@ WIDE = np.deg2rad(45.0)  # a turn that makes one look for a shorter way out
 STARTS = tuple(np.deg2rad(s) for s in ((30.0, 0.0, 0.0), (30.0, 30.0, 30.0), (30.0, -30.0, -30.0)))
 ROUNDS, PATIENCE = 9, 2  # rounds at most, and rounds without a better result
 FEW_FAULTS = 0.005
+STIFFER, STIFFEST = 2.0, 16.0  # weight of what a round leaves on the skin, from round to round
 DONE = 0.5  # of what the source shows on a body: what a block leaves at most that has done its work
 LESS = 0.8  # of the mean square of all turns: a tenth of the turns themselves
 CLOSER = (0, 1)  # rounds after which more frames are looked at
@@ -76,6 +77,7 @@ class Stage(NamedTuple):
     columns: list[int]
     allowed: Float[np.ndarray, "frames pairs"]
     quiet: Bool[np.ndarray, " pairs"]
+    stiffness: float = 1.0  # weight of what the skin shows
 
 
 class Iterate(NamedTuple):
@@ -203,7 +205,8 @@ def limbs(
         if not round_ and start is None:
             result = _from_elsewhere(problem, result, stages)
         correction, history = result.correction, [*history, *result.history]
-        moved = result.motion[np.arange(small.frame_count)]
+        whole = case.moved(correction)
+        moved = whole[seen.frames]
         probes = probe_depths(everything, moved)
         after = volume_depths(everything, moved, probes)
         used = np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
@@ -220,7 +223,7 @@ def limbs(
             quiet = quiet & ~woken
             stages = [_wake(s, woken[s.columns], kept[:, s.columns]) for s in stages]
         left = case.left(after, on_skin, quiet)
-        jerk = derivative_ratio(case.moved(correction), base, 3) or 1.0
+        jerk = derivative_ratio(whole, base, 3) or 1.0
         faults = max(jerk - MOST_JERK, 0.0) / 0.2 + _amount(left) / TOLERANCE
         found = Iterate(faults, correction, result.problem, after, allowed - used, left.max(initial=0.0))
         # one that was looked at in fewer frames cannot be compared
@@ -241,6 +244,9 @@ def limbs(
             # the solver sees some probes only, and its corrections are smooth: what they left is taken off
             over = np.where(left > ENOUGH * TOLERANCE, after - used, 0.0)
             stages = [_tighten(s, over[:, s.columns], float(small.dt)) for s in stages]
+        if looks is not None and on_skin is not None and round_ > 0:  # what was found in a round counts in the next
+            shown = (np.where(quiet, 0.0, on_skin - looks.own) > ENOUGH * TOLERANCE).any(axis=0)
+            stages = [_stiffen(s) if shown[s.columns].any() else s for s in stages]
     if looks is not None and (best.left > TOLERANCE or known):
         worth = _worth_it(case, best.correction, stages, first)
         shown = case.moved(worth)[seen.frames]
@@ -435,6 +441,7 @@ def _problem(
     seen, everything, looks = case.seen, case.everything, case.looks
     real, length = seen.motion.frame_count, seen.padded.frame_count
     terms: dict[str, Term] = {}
+    weights: dict[str, float] = {}
     scores = np.zeros((0, 0))
     if everything.part_of_set:
         allowed = np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
@@ -453,13 +460,14 @@ def _problem(
         if looks is not None and f"{stage.block.name}_touches" in (stage.block.terms or ()):
             awake = np.array(stage.columns)[~stage.quiet]
             terms[f"{stage.block.name}_touches"] = looks.touch_term(awake, ALLOWED_EXCESS, length)
+            weights[f"{stage.block.name}_touches"] = stage.stiffness
     frames = np.arange(length)
     effort = Effort(np.array([SIGMA_EFFORT[c.name] for c in seen.controls]))
     terms["effort"] = During(effort, (frames < real).astype(float))
     terms["smoothness"] = During(Smoothness(smooth), (frames < real - 2).astype(float))
     steady = Steadiness(np.array([SIGMA_PACE.get(c.name, np.inf) for c in seen.controls]))
     terms["steadiness"] = During(steady, (frames < real - 1).astype(float))
-    return Problem(case.character, seen.padded, terms, seen.controls)
+    return Problem(case.character, seen.padded, terms, seen.controls, weights)
 
 
 def jerk_scale(base: Motion) -> float:
@@ -476,6 +484,11 @@ def jerk_scale(base: Motion) -> float:
 def _wake(stage: Stage, woken: Bool[np.ndarray, " pairs"], kept: Float[np.ndarray, "frames pairs"]) -> Stage:
     """The stage with some pairs no longer left alone."""
     return stage._replace(quiet=stage.quiet & ~woken, allowed=np.where(woken, kept, stage.allowed))
+
+
+def _stiffen(stage: Stage) -> Stage:
+    """What the skin still shows counts more: a fold may yield to nothing less, and a field that says otherwise."""
+    return stage._replace(stiffness=min(STIFFER * stage.stiffness, STIFFEST))
 
 
 def smooth_floor(limit: Float[np.ndarray, "frames pairs"], dt: float) -> Float[np.ndarray, "frames pairs"]:

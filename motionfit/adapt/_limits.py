@@ -1,6 +1,5 @@
 """What overlap does not count, that of the reference body, and looks at the skin itself."""
 
-import hashlib
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +11,7 @@ from motionfit._motion import Motion, host_kinematics, rest_motion
 from motionfit._onto import onto
 from motionfit.adapt._clearance import build_clearance, volume_depths
 from motionfit.adapt._touches import Touches, touch_term, touches_of
-from motionfit.metrics import TOLERANCE, insides, skin_depths
+from motionfit.metrics import TOLERANCE, insides, poses_of, shown_before, shown_in, skin_depths
 from motionfit.shape.pairs import Pair
 from motionfit.terms.penetration import TouchClearance
 
@@ -50,9 +49,8 @@ class SkinLooks:
     Near the shoulder the skin follows arm and trunk at once, and the fold of the joint is not quite where a field of
     one pose says. So what touches in a look becomes rows for the solver.
 
-    A look takes ten milliseconds or more, so no pose is looked at twice: what a frame showed is kept here, and what the
-    reference shows is kept with the reference, for the next body. Without a reference nothing is allowed: what lies
-    inside in the rest pose never counts (`motionfit.metrics.skin_depths`).
+    No pose is looked at twice: what a frame showed is kept here, with its touches. Without a reference nothing is
+    allowed: what lies inside in the rest pose never counts (`motionfit.metrics.skin_depths`).
     """
 
     def __init__(self, clip: Motion, character: Character, reference: Character | None, pairs: tuple[Pair, ...]):
@@ -72,14 +70,7 @@ class SkinLooks:
         """What the reference shows."""
         if self.reference is None:
             return np.zeros((len(at), len(self.pairs)))
-        played = onto(self.clip[at], self.reference.skeleton)
-        known = self.reference.memo.setdefault(("shown", self.pairs), {})
-        poses = _poses(played)
-        new = np.array([i for i, pose in enumerate(poses) if pose not in known], int)
-        if len(new):
-            shown = skin_depths(self.reference, played[new], self.pairs).depth
-            known.update({poses[i]: depths for i, depths in zip(new, shown, strict=True)})
-        return np.array([known[pose] for pose in poses]).reshape(len(at), len(self.pairs))
+        return skin_depths(self.reference, onto(self.clip[at], self.reference.skeleton), self.pairs).depth
 
     def anew(self) -> "SkinLooks":
         """Looks that start over, but look at no pose twice."""
@@ -106,17 +97,15 @@ class SkinLooks:
     def _look(self, motion: Motion, at: Int[np.ndarray, " some"]) -> dict[tuple[int, bytes], Look]:
         """What each look shows; poses that were seen before are not looked at again."""
         looked = motion[at]
-        keys = list(zip(at.tolist(), _poses(looked), strict=True))
+        keys = list(zip(at.tolist(), poses_of(looked), strict=True))
         new = np.array([i for i, key in enumerate(keys) if key not in self.seen], int)
         if len(new):
             looked, own = looked[new], self._own(at[new])
-            rotations = host_kinematics(looked)[1]
+            rotations, known = host_kinematics(looked)[1], shown_before(self.character, self.pairs)
             for k, vertices, found in insides(self.character, looked, self.pairs):
-                depths = np.zeros(len(self.pairs))
-                for (pair, *_), inside in found.items():
-                    depths[pair] = max(depths[pair], inside.depth.max(initial=0.0))
-                touches = touches_of(self.character, rotations[k], vertices, found, own[k])
-                self.seen[keys[new[k]]] = Look(depths, touches)
+                key = keys[new[k]]
+                known[key[1]] = shown = shown_in(found, len(self.pairs))
+                self.seen[key] = Look(shown.depth, touches_of(self.character, rotations[k], vertices, found, own[k]))
         return {key: self.seen[key] for key in keys}
 
     def touch_term(
@@ -196,14 +185,10 @@ class SkinLooks:
         self, excess: Float[np.ndarray, "frames pairs"], on_skin: Float[np.ndarray, "looks pairs"],
         quiet: Bool[np.ndarray, " pairs"],
     ) -> Float[np.ndarray, "frames pairs"]:  # fmt: skip
-        """Excess [m] on the fields or, in the looks, on the skin where that is more; 0 for quiet pairs."""
-        excess = excess.copy()
-        excess[self.at] = np.maximum(excess[self.at], on_skin)
-        return np.where(quiet, 0.0, excess)
-
-
-def _poses(motion: Motion) -> list[bytes]:
-    """What tells the frames of a motion apart: the skin is a function of it."""
-    arrays = [motion.root, motion.rotations, *(() if motion.translations is None else (motion.translations,))]
-    rows = [np.ascontiguousarray(np.asarray(x)).reshape(motion.frame_count, -1) for x in arrays]
-    return [hashlib.sha256(b"".join(r[t].tobytes() for r in rows)).digest() for t in range(motion.frame_count)]
+        """Excess [m] on the skin where it was looked at, in between on the fields as far as the looks on both sides bear
+        them out; 0 for quiet pairs."""
+        wrong = on_skin - excess[self.at]
+        # where both say that parts are apart, only the fields know how far
+        wrong = np.where((on_skin <= 0.0) & (excess[self.at] <= 0.0), 0.0, wrong)
+        result = excess + np.stack([np.interp(self.frames, self.at, w) for w in wrong.T], axis=1)
+        return np.where(quiet, 0.0, result)
