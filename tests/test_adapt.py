@@ -15,7 +15,7 @@ from motionfit import samples
 from motionfit._motion import Motion, host_kinematics, joint_angles, resample
 from motionfit.adapt._clearance import build_clearance, probe_depths, support
 from motionfit.adapt._controls import arm_controls
-from motionfit.adapt._limbs import _own_sets, _stages
+from motionfit.adapt._stages import own_sets, stages_of
 from motionfit.metrics import derivative_ratio, skin_depths
 from motionfit.shape.growth import grow
 from motionfit.shape.pairs import pairs_of
@@ -198,8 +198,9 @@ def test_a_block_chooses_its_probes_by_their_own_part_in_what_is_wrong(heavy):
     everything = build_clearance(heavy, pairs)
     allowed = np.random.default_rng(0).uniform(0.0, 0.03, (walk.frame_count, len(pairs)))
     together = support(everything, probe_depths(everything, walk), allowed)
-    for stage in _stages(heavy, ("arms", "legs"), pairs, "vertex", allowed, np.zeros(len(pairs), bool)):
-        mine = _own_sets(everything, stage)
+    nothing = np.zeros_like(allowed)
+    for stage in stages_of(heavy, ("arms", "legs"), pairs, "vertex", allowed, np.zeros(len(pairs), bool), nothing):
+        mine = own_sets(everything, stage)
         np.testing.assert_allclose(
             together[mine], support(stage.clearance, probe_depths(stage.clearance, walk), stage.allowed), rtol=1e-6
         )

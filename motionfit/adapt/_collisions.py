@@ -24,10 +24,10 @@ from motionfit.adapt._clearance import all_rows, build_clearance
 from motionfit.adapt._controls import Turn, turn_controls
 from motionfit.adapt._easing import between, eased, rougher, sinking_skin
 from motionfit.adapt._groups import GROUPS, Group, Known, Meetings, known_depths
-from motionfit.adapt._limbs import jerk_scale
 from motionfit.adapt._limits import NEARLY, SkinLooks
 from motionfit.adapt._record import on_top, put_down
 from motionfit.adapt._sampling import Sampling, sampling
+from motionfit.adapt._stages import jerk_scale
 from motionfit.metrics import TOLERANCE, skin_depths, skin_gaps
 from motionfit.shape.pairs import PAIRS, Pair
 from motionfit.terms.pose import Effort, Smoothness

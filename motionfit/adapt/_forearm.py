@@ -21,10 +21,10 @@ from motionfit.adapt._clearance import probe_depths, reduced, support
 from motionfit.adapt._controls import Turn, turn_controls
 from motionfit.adapt._easing import eased, sinking_skin
 from motionfit.adapt._groups import Group, filled, known_depths
-from motionfit.adapt._limbs import SOLVE_PROBES, jerk_scale, smooth_floor
 from motionfit.adapt._limits import SkinLooks
 from motionfit.adapt._record import on_top, put_down
 from motionfit.adapt._sampling import sampling
+from motionfit.adapt._stages import SOLVE_PROBES, jerk_scale, smooth_floor
 from motionfit.metrics import TOLERANCE, derivative_ratio
 from motionfit.shape.pairs import PAIRS
 from motionfit.terms.pose import Direction, Effort, Smoothness

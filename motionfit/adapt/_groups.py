@@ -14,8 +14,8 @@ from motionfit._skeleton import SIDES
 from motionfit._types import InputError
 from motionfit.adapt._clearance import Clearance, counted_probes, kept_with, point_by_point, support
 from motionfit.adapt._controls import Turn
-from motionfit.adapt._limbs import smooth_floor
 from motionfit.adapt._sampling import Sampling
+from motionfit.adapt._stages import smooth_floor
 from motionfit.shape.field import fit_field
 from motionfit.shape.pairs import Pair
 from motionfit.shape.probes import Probes, ProbeSets

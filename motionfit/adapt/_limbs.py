@@ -5,55 +5,45 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
+from jaxtyping import Bool, Float
+from scipy.ndimage import gaussian_filter1d
 
 from motionfit._character import Character
 from motionfit._control import Control, Correction
 from motionfit._fit import Fit, fit
-from motionfit._motion import Motion, host_kinematics
+from motionfit._motion import Motion
 from motionfit._onto import onto
-from motionfit._problem import During, Problem, Term
-from motionfit._skeleton import SIDES
-from motionfit._solve import Block
+from motionfit._problem import Problem
 from motionfit._types import InputError
-from motionfit.adapt._clearance import (
-    Clearance,
-    allowance,
-    build_clearance,
-    probe_depths,
-    reduced,
-    support,
-    volume_depths,
-)
+from motionfit.adapt._clearance import allowance, build_clearance, probe_depths, volume_depths
 from motionfit.adapt._controls import arm_controls, leg_controls
 from motionfit.adapt._limits import ENOUGH, NEARLY, SkinLooks, reference_depths
-from motionfit.adapt._sampling import SOLVE_RATE, sampling
+from motionfit.adapt._sampling import sampling
+from motionfit.adapt._stages import (
+    ALLOWED_EXCESS,
+    SIGMA_EFFORT,
+    Case,
+    Seen,
+    Stage,
+    in_order,
+    jerk_scale,
+    problem_of,
+    stages_of,
+    stiffen,
+    tighten,
+    together,
+    wake,
+)
 from motionfit.metrics import TOLERANCE, derivative_ratio
 from motionfit.shape.pairs import Pair, pairs_of
 from motionfit.splines import Basis
-from motionfit.terms.pose import Effort, Smoothness, Steadiness
 
 LIMBS = ("arms", "legs")
 
 RATE = 30.0  # [1/s] of the frames that the solver sees: three for every knot
-SOLVE_PROBES = {"upper_arm": 20, "forearm": 16, "hand": 12, "thigh": 20, "calf": 20}  # per pair, of those looked at
-# [m] that may stay where more was; well under TOLERANCE, which the skin is judged by: much that is in a little adds up
-# too, and a body that leans and comes down to balance brings its thighs some 2 mm nearer
-ALLOWED_EXCESS = 0.002
 MARGIN = 0.001  # [m]
+DOUBTFUL = 0.003  # [m] between two looks, where there may be a centimetre
 DOUBTED = 0.02  # [m] on the fields of a shoulder that shows nothing on the skin
-LEAST_GAP = 0.005  # [m]
-# Across and twist are there for what r alone cannot do, and the skin around a shoulder is known least where it twists
-SIGMA_EFFORT = {
-    **{f"{side}_arm{kind}": sigma for side in SIDES for kind, sigma in (("", 1.0), ("_across", 1.0), ("_twist", 0.4))},
-    "hip_turn": 0.1,
-    "thighs_apart": 1.0,
-}  # [rad]
-SIGMA_PACE = {"hip_turn": 0.3, "thighs_apart": 0.3}  # [rad/s]: a stance may widen over seconds, not within a step
-JERK_SHARE = 4.0  # of the hands' own jerk, what the correction may add at the cost of 1 per frame
-LEVER = 0.5  # [m] shoulder to hand
-LEAST_JERK = 30.0  # [m/s^3] for clips that stand still
 MOST_JERK = 1.04  # ratio to the source's
 CALM = 2.0  # knots over which a correction that is too jerky is smoothed before it is solved again
 WIDE = np.deg2rad(45.0)  # a turn that makes one look for a shorter way out
@@ -61,23 +51,9 @@ WIDE = np.deg2rad(45.0)  # a turn that makes one look for a shorter way out
 STARTS = tuple(np.deg2rad(s) for s in ((30.0, 0.0, 0.0), (30.0, 30.0, 30.0), (30.0, -30.0, -30.0)))
 ROUNDS, PATIENCE = 9, 2  # rounds at most, and rounds without a better result
 FEW_FAULTS = 0.005
-STIFFER, STIFFEST = 2.0, 16.0  # weight of what a round leaves on the skin, from round to round
 DONE = 0.5  # of what the source shows on a body: what a block leaves at most that has done its work
 LESS = 0.8  # of the mean square of all turns: a tenth of the turns themselves
 CLOSER = (0, 1)  # rounds after which more frames are looked at
-LONG = 8192  # frames that the solver sees, from which on blocks are solved one by one: each takes half a gigabyte then
-
-
-class Stage(NamedTuple):
-    """A block of the solve: its clearance on all probes, the `columns` of its pairs, and the depths [m] that may stay,
-    per frame and pair."""
-
-    block: Block
-    clearance: Clearance
-    columns: list[int]
-    allowed: Float[np.ndarray, "frames pairs"]
-    quiet: Bool[np.ndarray, " pairs"]
-    stiffness: float = 1.0  # weight of what the skin shows
 
 
 class Iterate(NamedTuple):
@@ -104,53 +80,6 @@ class Iterate(NamedTuple):
     def better_than(self, other: "Iterate") -> bool:
         """Fewer faults; of two that are clean the one that turns clearly less, since it is nearer to sinking in."""
         return bool(self.turn < LESS * other.turn if self.clean and other.clean else self.faults < other.faults)
-
-
-class Seen(NamedTuple):
-    """The clip as the solver sees it: some of its frames, repeated at the end up to a bucket's length."""
-
-    frames: Int[np.ndarray, " seen"]  # of the clip
-    motion: Motion
-    padded: Motion
-    basis: Basis
-    controls: tuple[Control, ...]
-
-
-class Case(NamedTuple):
-    """What stays as it is from round to round: the clip on the body, whole and as the solver sees it, its controls, the
-    clearance of all pairs on all probes, the depths [m] that do not count, and the looks at the skin (None: the volumes
-    judge alone)."""
-
-    character: Character
-    base: Motion
-    controls: tuple[Control, ...]
-    basis: Basis
-    seen: Seen
-    everything: Clearance
-    own: Float[np.ndarray, "frames pairs"]
-    looks: SkinLooks | None
-
-    @property
-    def pairs(self) -> tuple[Pair, ...]:
-        return self.everything.pairs
-
-    def final(self, correction: Correction) -> Correction:
-        """The correction of the whole clip: its controls in every frame, and the control points that they need."""
-        return Correction(self.controls, tuple(np.asarray(p)[: self.basis.count] for p in correction.points))
-
-    def moved(self, correction: Correction) -> Motion:
-        """The whole clip, corrected."""
-        return self.final(correction).apply(self.base)
-
-    def left(
-        self, depths: Float[np.ndarray, "frames pairs"], on_skin: Float[np.ndarray, "looks pairs"] | None,
-        quiet: Bool[np.ndarray, " pairs"],
-    ) -> Float[np.ndarray, "frames pairs"]:  # fmt: skip
-        """What counts [m]: the excess of all but quiet pairs, on the volumes and in the looks."""
-        excess = depths - self.own
-        if self.looks is None or on_skin is None:
-            return np.where(quiet, 0.0, excess)
-        return self.looks.joined(excess, on_skin - self.looks.own, quiet)
 
 
 def limbs(
@@ -188,19 +117,23 @@ def limbs(
     if looks is not None:  # first in the frames that were looked at when an adapted clip was made
         shown = before if first is None else volume_depths(everything, first)
         looks.look_closer((shown - own).max(axis=1))
-    quiet, kept = _quiet(before - own, own, case.pairs, None if looks is None else looks.quiet(looks.depths(small)))
+    clear, phantom = None, np.zeros_like(own)
+    if looks is not None:
+        at_start = looks.depths(small)
+        clear, phantom = looks.quiet(at_start), looks.phantom(before - own, at_start - looks.own)
+    quiet, kept, phantom = _quiet(before - own, own, case.pairs, clear, phantom)
     settled = checked = known and bool(quiet.all())  # and what is settled was looked at closely then
     correction = _beginning(case, start)
     allowed = np.where(quiet, np.maximum(before, own), kept)
     held_back = np.zeros_like(own) if start is None else np.where(quiet, 0.0, start.details["held_back_m"])
 
-    stages = _stages(character, blocks, case.pairs, objective, allowed - held_back, quiet, looks is not None)
+    stages = stages_of(character, blocks, case.pairs, objective, allowed - held_back, quiet, phantom, looks is not None)
     smooth, history, since, easing, on_skin, missed = jerk_scale(base), [], 0, False, None, False
     best = Iterate(np.inf, correction, None, before, held_back, np.inf)
 
     for round_ in range(ROUNDS):
-        problem = _problem(case, stages, smooth, (at_first, probes))
-        result = fit(problem, _together(stages, seen), sweeps, correction=correction,
+        problem = problem_of(case, stages, smooth, (at_first, probes))
+        result = fit(problem, together(stages, seen), sweeps, correction=correction,
                      progress=_told(progress, round_, sweeps * len(stages)))  # fmt: skip
         if not round_ and start is None:
             result = _from_elsewhere(problem, result, stages)
@@ -209,19 +142,20 @@ def limbs(
         moved = whole[seen.frames]
         probes = probe_depths(everything, moved)
         after = volume_depths(everything, moved, probes)
-        used = np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
+        used = in_order(stages, [s.allowed for s in stages])
         if looks is not None:
             if round_ in CLOSER and not settled:
                 looks.look_closer((after - own).max(axis=1))
             on_skin, missed = looks.depths_and_touches(moved), False
-            if round_ >= CLOSER[-1] and not checked and (on_skin <= looks.own + TOLERANCE).all():
-                # clean where it was looked at: in between it is looked at once
-                missed = looks.look_between(moved)
-                on_skin, checked = looks.depths_and_touches(moved), not missed
+            if round_ >= CLOSER[-1] and (easing or not checked) and (on_skin <= looks.own + TOLERANCE).all():
+                # clean where it was looked at: in between it is looked at once, and again where more may show since
+                near = case.left(after, on_skin, quiet).max(axis=1) > DOUBTFUL
+                missed = looks.look_between(moved, near, not checked)
+                on_skin, checked = looks.depths_and_touches(moved), checked or not missed
             # what the first looks missed
             woken = quiet & ~looks.quiet(on_skin)
             quiet = quiet & ~woken
-            stages = [_wake(s, woken[s.columns], kept[:, s.columns]) for s in stages]
+            stages = [wake(s, woken[s.columns], kept[:, s.columns]) for s in stages]
         left = case.left(after, on_skin, quiet)
         jerk = derivative_ratio(whole, base, 3) or 1.0
         faults = max(jerk - MOST_JERK, 0.0) / 0.2 + _amount(left) / TOLERANCE
@@ -230,7 +164,7 @@ def limbs(
         if found.better_than(best) or missed or round_ in CLOSER:
             best, since = found, 0
         since += 1
-        easing |= found.clean and (settled or round_ >= CLOSER[-1])
+        easing = (easing and not missed) or (found.clean and (settled or round_ >= CLOSER[-1]))
         if easing:
             if looks is None or on_skin is None or not looks.ease(on_skin, ALLOWED_EXCESS):
                 break
@@ -240,13 +174,10 @@ def limbs(
         if jerk > MOST_JERK:
             smooth *= 0.5
             correction = _calmed(correction)
-        if left.max() > ENOUGH * TOLERANCE:
-            # the solver sees some probes only, and its corrections are smooth: what they left is taken off
-            over = np.where(left > ENOUGH * TOLERANCE, after - used, 0.0)
-            stages = [_tighten(s, over[:, s.columns], float(small.dt)) for s in stages]
+        stages = _pressed(case, stages, after, left)
         if looks is not None and on_skin is not None and round_ > 0:  # what was found in a round counts in the next
-            shown = (np.where(quiet, 0.0, on_skin - looks.own) > ENOUGH * TOLERANCE).any(axis=0)
-            stages = [_stiffen(s) if shown[s.columns].any() else s for s in stages]
+            shown = np.max(np.where(quiet, 0.0, on_skin - looks.own), axis=0, initial=0.0) > ENOUGH * TOLERANCE
+            stages = [stiffen(s) if shown[s.columns].any() else s for s in stages]
     if looks is not None and (best.left > TOLERANCE or known):
         worth = _worth_it(case, best.correction, stages, first)
         shown = case.moved(worth)[seen.frames]
@@ -298,21 +229,21 @@ def _told(progress: Callable[[str, int, int], None] | None, round_: int, steps: 
 
 def _quiet(
     excess: Float[np.ndarray, "frames pairs"], own: Float[np.ndarray, "frames pairs"], pairs: tuple[Pair, ...],
-    clear: Bool[np.ndarray, " pairs"] | None,
-) -> tuple[Bool[np.ndarray, " pairs"], Float[np.ndarray, "frames pairs"]]:  # fmt: skip
-    """The pairs that show no violation, which are left alone, and the depth [m] that may stay in the others. `clear`
-    are those that show none on the skin (None: it was not looked at)."""
+    clear: Bool[np.ndarray, " pairs"] | None, phantom: Float[np.ndarray, "frames pairs"],
+) -> tuple[Bool[np.ndarray, " pairs"], Float[np.ndarray, "frames pairs"], Float[np.ndarray, "frames pairs"]]:  # fmt: skip
+    """The pairs that show no violation, which are left alone, and the depth [m] that may stay in the others, without
+    what is `phantom`, and that [m]. `clear` are those that show none on the skin (None: it was not looked at)."""
     most, kept = excess.max(axis=0), own + allowance(excess, ALLOWED_EXCESS, MARGIN)
     quiet = most <= TOLERANCE
     if clear is None:
-        return quiet, kept
+        return quiet, kept, phantom
     # near the shoulder the skin alone knows; but where the arm has to turn anyway, and the fields show a little more
     # than the tolerance, they lose that too
-    phantom = clear & ~quiet & np.array([p.first.endswith("upper_arm") for p in pairs])
-    quiet = (clear & quiet) | phantom
+    lone = clear & ~quiet & np.array([p.first.endswith("upper_arm") for p in pairs])
+    quiet = (clear & quiet) | lone
     arm_of = np.array([p.first.partition("_")[0] if p.block == "arms" else p.block for p in pairs])
-    phantom &= (most <= DOUBTED) & np.isin(arm_of, arm_of[~quiet])
-    return quiet & ~phantom, np.where(phantom, own + ENOUGH * TOLERANCE - MARGIN, kept)
+    lone &= (most <= DOUBTED) & np.isin(arm_of, arm_of[~quiet])
+    return quiet & ~lone, np.where(lone, own + ENOUGH * TOLERANCE - MARGIN, kept), np.where(lone, 0.0, phantom)
 
 
 def _from_elsewhere(problem: Problem, result: Fit, stages: list[Stage]) -> Fit:
@@ -334,6 +265,19 @@ def _from_elsewhere(problem: Problem, result: Fit, stages: list[Stage]) -> Fit:
                 result, cost = again, again.history[-1].cost_after
             result = dataclasses.replace(result, history=history)
     return result
+
+
+def _pressed(
+    case: Case, stages: list[Stage], after: Float[np.ndarray, "frames pairs"], left: Float[np.ndarray, "frames pairs"]
+) -> list[Stage]:
+    """The stages with less allowed where much is `left` [m]: the solver sees some probes only, and its corrections are
+    smooth, so what the depths `after` it [m] go beyond what it was allowed is taken off."""
+    over = after - in_order(stages, [s.allowed + s.phantom for s in stages])
+    # no rows of the solve know what the skin shows between legs
+    legs = np.array([p.block == "legs" for p in case.pairs])
+    over = np.where(legs, np.maximum(over, left - ALLOWED_EXCESS), over)
+    over = np.where(left > ENOUGH * TOLERANCE, over, 0.0)
+    return [tighten(s, over[:, s.columns], float(case.seen.motion.dt)) for s in stages]
 
 
 def _worth_it(case: Case, correction: Correction, stages: list[Stage], first: Motion | None) -> Correction:
@@ -371,23 +315,9 @@ def _check_start(start: Fit, seen: Seen, pairs: tuple[Pair, ...]) -> None:
                          "and blocks, or leave it out")  # fmt: skip
 
 
-def _together(stages: list[Stage], seen: Seen) -> Sequence[Block | tuple[Block, ...]]:
-    """The legs do not look at the arms, so they go with the first one. The other arm shares its program, and waits."""
-    blocks = [s.block for s in stages]
-    legs = tuple(b for b in blocks if b.name == "legs")
-    if len(blocks) == 1 or not legs or seen.padded.frame_count >= LONG:
-        return blocks
-    return [(blocks[0], *legs), *(b for b in blocks[1:] if b not in legs)]
-
-
 def _amount(over: Float[np.ndarray, "frames pairs"]) -> float:
     """Mean over frames of what goes beyond what a look may show [m]."""
     return float(np.maximum(over - ENOUGH * TOLERANCE, 0.0).max(axis=1).mean())
-
-
-def _order(stages: list[Stage]) -> Int[np.ndarray, " pairs"]:
-    """Where each pair stands among the stages' columns."""
-    return np.argsort(np.concatenate([s.columns for s in stages]))
 
 
 def _controls(character: Character, base: Motion, blocks: Sequence[str]) -> tuple[tuple[Control, ...], Basis, Seen]:
@@ -402,105 +332,3 @@ def _controls(character: Character, base: Motion, blocks: Sequence[str]) -> tupl
 
     padded = dataclasses.replace(base[at.rows], dt=np.asarray(at.dt))
     return controls, whole, Seen(at.frames, at.motion(base), padded, at.basis, tuple(at.control(c) for c in controls))
-
-
-def _stages(
-    character: Character, blocks: Sequence[str], pairs: tuple[Pair, ...], objective: str,
-    allowed: Float[np.ndarray, "frames pairs"], quiet: Bool[np.ndarray, " pairs"], touching: bool = False,
-) -> list[Stage]:  # fmt: skip
-    """The blocks of each recipe, in order: left arm, right arm, legs."""
-    made = []
-    for recipe in blocks:
-        if recipe == "arms":
-            wanted = [(f"{s}_arm", tuple(f"{s}_arm{k}" for k in ("", "_across", "_twist")),
-                       tuple(p for p in pairs if p.block == "arms" and p.first.startswith(s))) for s in SIDES]  # fmt: skip
-        else:
-            wanted = [("legs", ("hip_turn", "thighs_apart"), tuple(p for p in pairs if p.block == "legs"))]
-        for name, controls, mine in wanted:
-            clearance = build_clearance(character, mine, objective)
-            columns = [pairs.index(p) for p in clearance.pairs]
-            # fields see thighs well, and the fold between them, where they touch, opens in no one direction
-            touches = (f"{name}_touches",) if touching and recipe == "arms" else ()
-            # a foot that stands shall not slide; arms may come and go
-            steady = ("steadiness",) if recipe == "legs" else ()
-            terms = (f"{name}_clearance", *touches, "effort", "smoothness", *steady)
-            block = Block(name, controls, terms, max_steps=24, tolerance=1e-3)
-            made.append(Stage(block, clearance, columns, allowed[:, columns], quiet[columns]))
-    return made
-
-
-def _own_sets(everything: Clearance, stage: Stage) -> Bool[np.ndarray, " sets"]:
-    """Which sets of probes of all pairs are a stage's: both come in the order of their pairs."""
-    return np.isin(everything.pair_of_row, stage.columns)
-
-
-def _problem(
-    case: Case, stages: list[Stage], smooth: float, probes: tuple[Float[np.ndarray, "frames sets points"] | None, ...]
-) -> Problem:
-    """The terms of all stages; `probes` are the depths of all, by which those that matter are chosen."""
-    seen, everything, looks = case.seen, case.everything, case.looks
-    real, length = seen.motion.frame_count, seen.padded.frame_count
-    terms: dict[str, Term] = {}
-    weights: dict[str, float] = {}
-    scores = np.zeros((0, 0))
-    if everything.part_of_set:
-        allowed = np.concatenate([s.allowed for s in stages], axis=1)[:, _order(stages)]
-        scores = np.sum([support(everything, depth, allowed) for depth in probes], axis=0)
-    for stage in stages:
-        # however much the skin shows: a part that is LEAST_GAP away from the other's field is pushed no further
-        limit = np.maximum(stage.allowed, -LEAST_GAP)
-        limit = np.where(stage.quiet, stage.allowed, smooth_floor(limit, float(seen.motion.dt)))
-        # the frames that only fill the bucket cost nothing
-        limit = np.concatenate([limit, np.full((length - real, limit.shape[1]), 1e3)])
-        name = f"{stage.block.name}_clearance"
-        if stage.clearance.part_of_set:
-            terms[name] = reduced(stage.clearance, scores[_own_sets(everything, stage)], limit, SOLVE_PROBES)  # pyright: ignore[reportArgumentType]
-        else:
-            terms[name] = stage.clearance.allowing(limit)
-        if looks is not None and f"{stage.block.name}_touches" in (stage.block.terms or ()):
-            awake = np.array(stage.columns)[~stage.quiet]
-            terms[f"{stage.block.name}_touches"] = looks.touch_term(awake, ALLOWED_EXCESS, length)
-            weights[f"{stage.block.name}_touches"] = stage.stiffness
-    frames = np.arange(length)
-    effort = Effort(np.array([SIGMA_EFFORT[c.name] for c in seen.controls]))
-    terms["effort"] = During(effort, (frames < real).astype(float))
-    terms["smoothness"] = During(Smoothness(smooth), (frames < real - 2).astype(float))
-    steady = Steadiness(np.array([SIGMA_PACE.get(c.name, np.inf) for c in seen.controls]))
-    terms["steadiness"] = During(steady, (frames < real - 1).astype(float))
-    return Problem(case.character, seen.padded, terms, seen.controls, weights)
-
-
-def jerk_scale(base: Motion) -> float:
-    """[rad/s^3] of a shoulder that adds as much jerk at the hand as the clip has itself, noise left out."""
-    dt = float(base.dt)
-    hands = [j for s in SIDES if (j := base.skeleton.find(f"{s}_hand")) is not None]
-    if base.frame_count < 4 or not hands:
-        return JERK_SHARE * LEAST_JERK / LEVER
-    positions = gaussian_filter1d(host_kinematics(base)[0][:, hands], 1 / (SOLVE_RATE * dt), axis=0, mode="nearest")
-    jerk = float(np.linalg.norm(np.diff(positions, 3, axis=0), axis=-1).mean()) / dt**3
-    return JERK_SHARE * max(jerk, LEAST_JERK) / LEVER
-
-
-def _wake(stage: Stage, woken: Bool[np.ndarray, " pairs"], kept: Float[np.ndarray, "frames pairs"]) -> Stage:
-    """The stage with some pairs no longer left alone."""
-    return stage._replace(quiet=stage.quiet & ~woken, allowed=np.where(woken, kept, stage.allowed))
-
-
-def _stiffen(stage: Stage) -> Stage:
-    """What the skin still shows counts more: a fold may yield to nothing less, and a field that says otherwise."""
-    return stage._replace(stiffness=min(STIFFER * stage.stiffness, STIFFEST))
-
-
-def smooth_floor(limit: Float[np.ndarray, "frames pairs"], dt: float) -> Float[np.ndarray, "frames pairs"]:
-    """The limit without its jumps, nowhere above it by much: what a spline can follow without a jerk."""
-    width = max(1, round(0.05 / dt))
-    return gaussian_filter1d(minimum_filter1d(limit, 2 * width + 1, axis=0), width, axis=0, mode="nearest")
-
-
-def _tighten(stage: Stage, left: Float[np.ndarray, "frames pairs"], dt: float) -> Stage:
-    """Less may stay where the solve left more [m] than it was allowed: per pair, around the frames that show it."""
-    more = np.where(left > 0.001, left, 0.0)
-    # wide enough for a spline to follow, and nowhere less than what the frame itself needs
-    width = max(1, round(0.1 / dt))
-    more = gaussian_filter1d(maximum_filter1d(more, 2 * width + 1, axis=0), width / 2, axis=0, mode="nearest")
-    return stage._replace(allowed=stage.allowed - np.minimum(1.3 * more, 0.02))

@@ -146,14 +146,17 @@ class SkinLooks:
             risk[max(taken[-1] - LOOKS_APART, 0) : taken[-1] + LOOKS_APART + 1] = -np.inf
         self._look_at(taken)
 
-    def look_between(self, motion: Motion) -> bool:
-        """Look at a motion in every second frame once, and from now on where some show nearly the tolerance. Says
-        whether there are any.
+    def look_between(
+        self, motion: Motion, near: Bool[np.ndarray, " frames"] | None = None, everywhere: bool = True
+    ) -> bool:
+        """Look at a motion once in every second frame, unless not `everywhere`, and in all that may be `near` the
+        tolerance; from now on where some show nearly as much. Says whether there are any.
 
         What is there in a single frame is let be: where the fold of an armpit opens a frame later than the reference's,
         an arm would have to be led out and back for it.
         """
-        at = np.union1d(self.frames[::EVERY], self.at)
+        at = np.union1d(self.at, self.frames[::EVERY] if everywhere else [])
+        at = np.union1d(at, [] if near is None else self.frames[near]).astype(int)
         over = at[self._excess(motion, at) > NEARLY * TOLERANCE]
         beside = np.intersect1d([over - 1, over + 1], self.frames)
         over = np.union1d(over, beside[self._excess(motion, beside) > ENOUGH * TOLERANCE])
@@ -180,6 +183,20 @@ class SkinLooks:
     def quiet(self, seen: Float[np.ndarray, "looks pairs"]) -> Bool[np.ndarray, " pairs"]:
         """The pairs of which no look shows more than the tolerance."""
         return (seen <= self.own + TOLERANCE).all(axis=0)  # pyright: ignore[reportReturnType]
+
+    def phantom(
+        self, excess: Float[np.ndarray, "frames pairs"], on_skin: Float[np.ndarray, "looks pairs"]
+    ) -> Float[np.ndarray, "frames pairs"]:
+        """How much [m] of the fields' excess the skin does not bear out; in between looks by the shares of it in those
+        on both sides that have any."""
+        result = np.zeros_like(excess)
+        for k in range(excess.shape[1]):
+            told = excess[self.at, k] > 0.0
+            if told.any():
+                share = 1.0 - np.maximum(on_skin[told, k], 0.0) / excess[self.at[told], k]
+                shares = np.interp(self.frames, self.at[told], np.maximum(share, 0.0))
+                result[:, k] = shares * np.maximum(excess[:, k], 0.0)
+        return result
 
     def joined(
         self, excess: Float[np.ndarray, "frames pairs"], on_skin: Float[np.ndarray, "looks pairs"],

@@ -38,8 +38,9 @@ from motionfit._skeleton import SIDES
 from motionfit._solve import Work, banded_solver, block_work
 from motionfit._types import InputError
 from motionfit.adapt._clearance import Clearance, build_clearance, volume_depths
-from motionfit.adapt._limbs import ALLOWED_EXCESS, LIMBS, SOLVE_PROBES, Stage
-from motionfit.adapt._limbs import _stages as limb_stages
+from motionfit.adapt._limbs import LIMBS
+from motionfit.adapt._stages import ALLOWED_EXCESS, SOLVE_PROBES, Stage
+from motionfit.adapt._stages import stages_of as limb_stages
 from motionfit.adapt._touches import touching_on
 from motionfit.banded import Banded
 from motionfit.metrics import skin_depths
@@ -164,7 +165,7 @@ class Held(NamedTuple):
         pairs = pairs_of(*recipes)
         nothing = np.zeros((frames, len(pairs)))
         stages = limb_stages(problem.character, recipes, pairs, "vertex" if SkinClearance in kinds else "capsule",
-                             nothing, np.zeros(len(pairs), bool),
+                             nothing, np.zeros(len(pairs), bool), nothing,
                              any(isinstance(t, TouchClearance) for t in problem.terms.values()))[::-1]  # fmt: skip
         points = tuple(_filled(fit.correction[c.name], c.basis.count) for c in problem.controls)
         held = cls(problem, reference, points, tuple(stages), frames, (), ())
