@@ -20,13 +20,15 @@ from motionfit._programs import program
 from motionfit._types import AnyArray, InputError
 from motionfit.banded import Banded
 
+SETTLED = 6  # steps that are looked at together
+
 
 class Block(eqx.Module):
     """Which controls are free, which terms count, which optimistix solver, how many steps.
 
     `solver` is any optimistix least-squares solver or minimiser. The default is Levenberg-Marquardt, banded in time
     where the terms' reach is known, which stops at a `tolerance`, relative and absolute, in control points [rad] and
-    residuals. `terms=None` means all terms of the problem.
+    residuals, or relative in the cost. `terms=None` means all terms of the problem.
     """
 
     name: str = eqx.field(static=True)
@@ -151,7 +153,11 @@ def _signals(controls: tuple[Control, ...], points: tuple[Array, ...]) -> Float[
 
 class _Remembers(eqx.Module):
     """An optimistix solver that also tells what its function said at the start, as `solution.stats["start"]`: the
-    first step of each is there. To ask the function once more would compile it once more."""
+    first step of each is there. To ask the function once more would compile it once more.
+
+    Levenberg-Marquardt also stops where the last `SETTLED` steps that it took lowered the cost by less than its `rtol`
+    of it, all together: over rows that come and go, points may wander along a valley for ever.
+    """
 
     inner: optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 
@@ -169,16 +175,24 @@ class _Remembers(eqx.Module):
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         start = jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), aux_struct)
-        return self.inner.init(fn, y, args, options, f_struct, aux_struct, tags), jnp.array(True), start
+        costs = jnp.full(SETTLED + 1, jnp.inf)
+        return self.inner.init(fn, y, args, options, f_struct, aux_struct, tags), jnp.array(True), start, costs
 
     def step(self, fn, y, args, options, state, tags):
-        inner, first, start = state
+        inner, first, start, costs = state
         y, inner, aux = self.inner.step(fn, y, args, options, inner, tags)
         start = jax.tree.map(lambda old, new: jnp.where(first, new, old), start, aux)
-        return y, (inner, jnp.array(False), start), aux
+        if isinstance(self.inner, optx.LevenbergMarquardt):
+            cost = jnp.sum(jnp.stack([jnp.sum(jnp.square(r)) for r in jax.tree.leaves(inner.f_info.residual)]))
+            latest = jnp.append(costs[1:], cost.astype(costs.dtype))
+            costs = jnp.where(inner.num_steps_since_acceptance == 0, latest, costs)
+        return y, (inner, jnp.array(False), start, costs), aux
 
     def terminate(self, fn, y, args, options, state, tags):
-        return self.inner.terminate(fn, y, args, options, state[0], tags)
+        inner, _, _, costs = state
+        done, result = self.inner.terminate(fn, y, args, options, inner, tags)
+        settled = jnp.isfinite(costs[0]) & (costs[-1] >= (1.0 - self.inner.rtol) * costs[0])
+        return done | settled, result
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         y, aux, stats = self.inner.postprocess(fn, y, aux, args, options, state[0], tags, result)

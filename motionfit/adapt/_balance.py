@@ -28,9 +28,9 @@ from motionfit.adapt._standing import distances, weighed
 from motionfit.balance import WINDOW, Soles, ZmpDistance
 from motionfit.feet._leg import Leg, find_legs, turn_legs
 from motionfit.feet._remove import detect_footplants
-from motionfit.metrics import TOLERANCE
+from motionfit.metrics import TOLERANCE, skin_depths
 from motionfit.shape.mass import Masses
-from motionfit.shape.pairs import PAIRS
+from motionfit.shape.pairs import PAIRS, pairs_of
 from motionfit.terms.balance import Standing, ZmpMargin
 from motionfit.terms.pose import Effort, Smoothness
 
@@ -47,6 +47,7 @@ PASS_OVER = 0.08  # [s] within which the weight goes from one foot to the other
 STRETCH = 0.998  # of a leg's length, as far as it may be stretched: straight legs leave no way to shift the hips
 ROUNDS, PATIENCE = 5, 2  # rounds at most, and rounds without a better result
 AROUND = 0.1  # [s]
+NEAR, LOOKS_APART = 0.02, 1 / 15  # [m] by the fields, from which on thighs are looked at on the skin, and how often [s]
 FADE, FADES = 0.25, 8  # what goes of a lean at once where it sinks in or is jerky, and how often
 OUTLIER = 0.05  # [m] beyond its threshold, from which on a frame counts by its distance, not by the square of that
 
@@ -267,16 +268,30 @@ def _jerk(motion: Motion) -> float:
 
 def _sinking(clip: Motion, character: Character, reference: Character | None, so_far: Motion, at: Sampling):
     """Says of a motion in which of the frames seen some pair shows nearly as much as the tolerance, and more than before
-    the block."""
-    clearance = build_clearance(character, PAIRS)
+    the block; of thighs and calves that come near each other on the skin too, which knows better where they touch."""
+    clearance, legs = build_clearance(character, PAIRS), pairs_of("legs")
     limit = reference_depths(clip[at.frames], character, reference, PAIRS)
     before = volume_depths(clearance, at.motion(so_far)) - limit
+    near = bool((before + limit)[:, [PAIRS.index(p) for p in legs]].max() > -NEAR)
+    looks = np.arange(0, len(at.frames), max(1, round(LOOKS_APART / at.dt)))
+    looked, own = at.frames[looks], 0.0
+    if near and reference is not None:
+        own = skin_depths(reference, onto(clip[looked], reference.skeleton), legs).depth
+    before_on_skin = skin_depths(character, so_far[looked], legs).depth - own if near else None
 
     def sinks(motion: Motion) -> Bool[np.ndarray, " seen"]:
         now = volume_depths(clearance, at.motion(motion)) - limit
-        return np.asarray((now > np.maximum(before + 0.001, NEARLY * TOLERANCE)).any(axis=1))
+        result = np.asarray((now > _most(before)).any(axis=1))
+        if before_on_skin is not None:
+            on_skin = skin_depths(character, motion[looked], legs).depth - own
+            result[looks] |= (on_skin > _most(before_on_skin)).any(axis=1)
+        return result
 
     return sinks
+
+
+def _most(before: Float[np.ndarray, "frames pairs"]) -> Float[np.ndarray, "frames pairs"]:
+    return np.maximum(before + 0.001, NEARLY * TOLERANCE)
 
 
 def _stood(

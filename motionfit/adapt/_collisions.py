@@ -411,6 +411,7 @@ class Attempt:
                 self.faults, self.result, self.best_points = shown.faults, result, self.points
         over, apart = shown.over, shown.apart
         self.done = max(over.max() - 0.7 * TOLERANCE, apart.max(), shown.on_skin.max(), rough) <= 0.0
+        self.done |= self.faults == 0.0 and self.rounds >= CLOSER[-1]
         if rough > 0.0:
             self.smooth *= 0.5
         self.allowed = self.allowed - np.where(over > 0.7 * TOLERANCE, np.minimum(over, 0.02), 0.0)
