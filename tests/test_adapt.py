@@ -18,7 +18,7 @@ from motionfit.adapt._controls import arm_controls
 from motionfit.adapt._stages import own_sets, stages_of
 from motionfit.metrics import derivative_ratio, skin_depths
 from motionfit.shape.growth import grow
-from motionfit.shape.pairs import pairs_of
+from motionfit.shape.pairs import PAIRS, pairs_of
 from motionfit.splines import bspline_basis
 
 pytestmark = pytest.mark.slow
@@ -278,6 +278,33 @@ def test_what_the_skin_never_showed_is_not_made_worse(shared_data):
     before, after = (skin_depths(dancer, m, step=20).depth - own for m in (fit.base, fit.motion))
     assert before.max() < 0.01
     assert after.max() < 0.01
+
+
+def test_a_phantom_between_thighs_moves_no_leg(shared_data):
+    """In a pirouette the fields see thighs 2.6 cm in each other that never touch. They came 14 degrees apart for it,
+    over four seconds, and the zero-moment point left its support by half a metre."""
+    clip = mf.load_motion(shared_data / "bvh" / "05_11_sideways_steps_pirouette.bvh")[1:481]
+    dancer, reference = (mf.load_character(shared_data / "characters" / f"{n}.glb")
+                         for n in ("athletic_female", "avg_male"))  # fmt: skip
+    fit = mf.adapt(clip, dancer, reference=reference, blocks=("legs",))
+    own = skin_depths(reference, mf.onto(clip, reference.skeleton), step=4).depth
+    before, after = (skin_depths(dancer, m, step=4).depth - own for m in (fit.base, fit.motion))
+    thighs = [p.name for p in PAIRS].index("left_thigh/right_thigh")
+    assert before[:, thighs].max() > 0.01 and after[:, thighs].max() < 0.01
+    assert joint_angles(fit.motion, fit.base).max() < np.deg2rad(5.0)
+
+
+def test_a_fold_that_yields_late_is_pressed_until_it_does(shared_data):
+    """A raised arm of a heavy dancer, whose fields and skin pull apart."""
+    clip = mf.load_motion(shared_data / "bvh" / "05_02_dance_arms_pirouette.bvh")[709:949]
+    heavy_male, reference = (mf.load_character(shared_data / "characters" / f"{n}.glb")
+                             for n in ("heavy_male", "avg_male"))  # fmt: skip
+    fit = mf.adapt(clip, heavy_male, reference=reference, blocks=("arms",))
+    own = skin_depths(reference, mf.onto(clip, reference.skeleton), step=4).depth
+    before, after = (skin_depths(heavy_male, m, step=4).depth - own for m in (fit.base, fit.motion))
+    shoulder = [p.name for p in PAIRS].index("left_upper_arm/torso")
+    assert before[:, shoulder].max() > 0.01 and (before > 0.01).any(axis=1).mean() > 0.5
+    assert after[:, shoulder].max() < 0.01 and fit.status == "converged"
 
 
 def test_an_arm_that_turns_anyway_loses_what_its_shoulder_shows_on_the_fields_alone(shared_data):

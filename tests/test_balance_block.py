@@ -4,16 +4,18 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import motionfit as mf
 from motionfit import samples
 from motionfit._control import Control, Correction, Drive
 from motionfit._motion import Motion, continued, host_kinematics, joint_angles, padded
-from motionfit.adapt._balance import _cleaned, _jerky, _Leaned
+from motionfit.adapt._balance import _cleaned, _jerky, _Leaned, _sinking
 from motionfit.adapt._controls import lean_controls
 from motionfit.adapt._record import recorded
 from motionfit.adapt._sampling import sampling
 from motionfit.metrics import derivative_ratio
+from motionfit.shape import grow
 from motionfit.splines import bspline_basis, per_frame
 from motionfit.terms import JointTracking, Standing
 from tests.helpers import central_difference, random_motion
@@ -218,6 +220,30 @@ def test_the_jerky_frames_are_those_without_which_there_is_no_more_jerk_than_all
     rest = (now - was).sum() - more.sum()
     assert rest <= 0.04 * was.sum() < rest + more.min()
     assert not _jerky(walk[:3], walk[:3]).any()
+
+
+@pytest.mark.slow
+def test_a_lean_gives_way_where_thighs_show_on_the_skin(average, monkeypatch):
+    """The skin of thighs is judged too, by the legs' pairs alone."""
+    heavy = grow(average, {"trunk": 1.1, "legs": 1.4})
+    walk = samples.walk(cycles=1)
+    so_far = mf.adapt(walk, heavy, reference=average, blocks=("arms", "legs"))
+    at = sampling(so_far.motion)
+    sinks = _sinking(walk, heavy, average, so_far.motion, at)
+    assert not sinks(so_far.motion).any()
+    rotations = np.array(so_far.motion.rotations, float)
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        joint = heavy.skeleton.joint(f"{side}_thigh")
+        turned = Rotation.from_rotvec([0.0, 0.0, -0.06 * sign]) * Rotation.from_quat(
+            rotations[:, joint], scalar_first=True
+        )
+        rotations[:, joint] = turned.as_quat(scalar_first=True)
+    together = dataclasses.replace(so_far.motion, rotations=rotations)
+    monkeypatch.setattr(
+        "motionfit.adapt._balance.volume_depths", lambda clearance, motion: np.full((len(at.frames), 12), -0.01)
+    )
+    blind = _sinking(walk, heavy, average, so_far.motion, at)  # the fields tell of nothing
+    assert blind(together).any() and not blind(so_far.motion).any()
 
 
 @pytest.mark.slow

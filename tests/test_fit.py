@@ -8,6 +8,7 @@ import pytest
 
 import motionfit as mf
 from motionfit._motion import rest_motion
+from motionfit._solve import SETTLED
 from motionfit.splines import bspline_basis
 
 
@@ -47,6 +48,24 @@ def test_least_squares_block_reaches_the_known_minimum(still):
     # two equal parabolas: the middle
     np.testing.assert_allclose(result.correction.signals(), target / 2, atol=1e-6)
     assert result.history[0].status == "converged" and result.history[0].cost_after < result.history[0].cost_before
+
+
+def test_a_solve_ends_where_it_gains_no_more(still):
+    """Down a valley without an end: each step moves the points by as much, and gains less than the tolerance."""
+    character, motion = still
+    control = _control(character, motion, "left_upper_arm", lower=-np.inf, upper=np.inf)
+
+    def valley(kin, _):
+        return jnp.stack([100.0 * jnp.ones_like(kin.signals), jnp.exp(-kin.signals)])
+
+    problem = mf.Problem(character, motion, {"valley": mf.Custom(valley)}, (control,))
+    steps = {}
+    for tolerance in (1e-3, 1e-7):
+        block = mf.Block("arm", ("left_upper_arm",), tolerance=tolerance)
+        (report,) = mf.fit(problem, (block,)).history
+        steps[tolerance] = report.status, report.accepted_steps
+    assert steps[1e-3] == ("converged", SETTLED + 1)  # the first is the start
+    assert steps[1e-7][1] > SETTLED + 1
 
 
 def test_minimisers_and_energies_work_and_are_refused_to_least_squares(still):

@@ -110,6 +110,49 @@ def test_touches_give_way_where_the_skin_is_out_too_far():
     assert not looks.ease(out, 0.002)
 
 
+def bare_looks(at, frames, own=0.0):
+    looks = object.__new__(SkinLooks)  # what it decides by, without a body
+    looks.at, looks.frames, looks.pairs = np.array(at), np.arange(frames), PAIRS[:1]
+    looks.own, looks.deepest, looks.eased = np.full((len(at), 1), own), *(np.zeros((len(at), 1)) for _ in range(2))
+    return looks
+
+
+def test_the_skin_goes_before_the_fields():
+    looks = bare_looks([0, 4, 8], 9)
+    on_fields = np.array([0.02] * 5 + [0.0, -0.01, -0.03, -0.05])[:, None]
+    on_skin = np.array([0.0, 0.03, 0.0])[:, None]  # less than on the fields, more, and apart on both
+    loud, quiet = np.zeros(1, bool), np.ones(1, bool)
+    told = looks.joined(on_fields, on_skin, loud)[:, 0]
+    np.testing.assert_allclose(told[[0, 4, 8]], [0.0, 0.03, -0.05], atol=1e-12)
+    np.testing.assert_allclose(told[2], 0.02 + (-0.02 + 0.01) / 2, atol=1e-12)  # half of what each look was off by
+    np.testing.assert_allclose(told[6], -0.01 + 0.01 / 2, atol=1e-12)  # that of the last is not known: both are apart
+    assert not looks.joined(on_fields, on_skin, quiet).any()
+
+
+def test_what_the_skin_does_not_bear_out_is_a_phantom():
+    looks = bare_looks([0, 2, 4, 6], 7)
+    on_fields = np.array([0.01, 0.02, 0.01, 0.03, 0.01, 0.02, -0.01])[:, None]
+    on_skin = np.array([0.0, 0.005, 0.02, 0.0])[:, None]
+    told = looks.phantom(on_fields, on_skin)[:, 0]
+    # all of it, half of it, none; nothing is said by a look in which the fields have none, and in between by shares
+    np.testing.assert_allclose(told, [0.01, 0.015, 0.005, 0.03 / 4, 0.0, 0.0, 0.0], atol=1e-12)
+    assert not looks.phantom(np.full((7, 1), -0.01), on_skin).any()
+
+
+def test_afterwards_only_what_comes_near_is_looked_at_again():
+    looks = bare_looks([0, 8], 9)
+    seen = []
+
+    def look(motion, at):
+        seen.extend(at.tolist())
+        return {t: Look(np.array([0.012 if t in (5, 6) else 0.0]), NONE) for t in at.tolist()}
+
+    looks._look, looks._own = look, lambda at: np.zeros((len(at), 1))
+    near = np.isin(looks.frames, [5, 6])
+    assert looks.look_between(rest_motion(samples.walk().skeleton), near, everywhere=False)
+    assert set(seen) == {0, 8, 4, 5, 6, 7} and looks.at.tolist() == [0, 5, 6, 8]  # 4 and 7 beside them
+
+
 @pytest.mark.parametrize("shown, beside, taken", [
     ({}, [], []),
     ({6: 0.95, 7: 0.92}, [5, 7], [6, 7]),
@@ -121,9 +164,7 @@ def test_touches_give_way_where_the_skin_is_out_too_far():
     ({3: 3.0}, [], []),  # between two frames that show nothing
 ])  # fmt: skip
 def test_what_is_clean_is_looked_at_in_between(shown, beside, taken):
-    looks = object.__new__(SkinLooks)  # what it decides by, without a body
-    looks.at, looks.frames, looks.pairs = np.array([0, 4, 8, 12]), np.arange(13), PAIRS[:1]
-    looks.own, looks.deepest, looks.eased = (np.zeros((4, 1)) for _ in range(3))
+    looks = bare_looks([0, 4, 8, 12], 13)
     looks._own = lambda at: np.full((len(at), 1), 0.02)
     seen = set()
 
