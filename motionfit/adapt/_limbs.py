@@ -147,8 +147,11 @@ def limbs(
             if round_ in CLOSER and not settled:
                 looks.look_closer((after - own).max(axis=1))
             on_skin, missed = looks.depths_and_touches(moved), False
-            if round_ >= CLOSER[-1] and (easing or not checked) and (on_skin <= looks.own + TOLERANCE).all():
-                # clean where it was looked at: in between it is looked at once, and again where more may show since
+            clean = bool((on_skin <= looks.own + TOLERANCE).all())
+            late = since >= PATIENCE or round_ >= ROUNDS - 1 - PATIENCE
+            if round_ >= CLOSER[-1] and (easing or not checked) and (clean or (late and not checked)):
+                # clean where it was looked at, or as clean as it gets: in between it is looked at once, and again where
+                # more may show since
                 near = case.left(after, on_skin, quiet).max(axis=1) > DOUBTFUL
                 missed = looks.look_between(moved, near, not checked)
                 on_skin, checked = looks.depths_and_touches(moved), checked or not missed
