@@ -20,7 +20,7 @@ from motionfit._programs import program
 from motionfit._types import AnyArray, InputError
 from motionfit.banded import Banded
 
-SETTLED = 6  # steps that are looked at together
+SETTLED, COARSE = 6, 1e-4  # steps that are looked at together, by a solver of at least this tolerance
 
 
 class Block(eqx.Module):
@@ -28,7 +28,7 @@ class Block(eqx.Module):
 
     `solver` is any optimistix least-squares solver or minimiser. The default is Levenberg-Marquardt, banded in time
     where the terms' reach is known, which stops at a `tolerance`, relative and absolute, in control points [rad] and
-    residuals, or relative in the cost. `terms=None` means all terms of the problem.
+    residuals, or, from 1e-4 on, relative in the cost. `terms=None` means all terms of the problem.
     """
 
     name: str = eqx.field(static=True)
@@ -155,8 +155,9 @@ class _Remembers(eqx.Module):
     """An optimistix solver that also tells what its function said at the start, as `solution.stats["start"]`: the
     first step of each is there. To ask the function once more would compile it once more.
 
-    Levenberg-Marquardt also stops where the last `SETTLED` steps that it took lowered the cost by less than its `rtol`
-    of it, all together: over rows that come and go, points may wander along a valley for ever.
+    Levenberg-Marquardt of a tolerance of `COARSE` or more also stops where the last `SETTLED` steps that it took
+    lowered the cost by less than its `rtol` of it, all together: over rows that come and go, points may wander along a
+    valley for ever. Where points are wanted more exactly than that, costs cannot tell when to stop.
     """
 
     inner: optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
@@ -182,7 +183,7 @@ class _Remembers(eqx.Module):
         inner, first, start, costs = state
         y, inner, aux = self.inner.step(fn, y, args, options, inner, tags)
         start = jax.tree.map(lambda old, new: jnp.where(first, new, old), start, aux)
-        if isinstance(self.inner, optx.LevenbergMarquardt):
+        if isinstance(self.inner, optx.LevenbergMarquardt) and self.inner.rtol >= COARSE:
             cost = jnp.sum(jnp.stack([jnp.sum(jnp.square(r)) for r in jax.tree.leaves(inner.f_info.residual)]))
             latest = jnp.append(costs[1:], cost.astype(costs.dtype))
             costs = jnp.where(inner.num_steps_since_acceptance == 0, latest, costs)
