@@ -276,9 +276,9 @@ def _pressed(
     """The stages with less allowed where much is `left` [m]: the solver sees some probes only, and its corrections are
     smooth, so what the depths `after` it [m] go beyond what it was allowed is taken off."""
     over = after - in_order(stages, [s.allowed + s.phantom for s in stages])
-    # no rows of the solve know what the skin shows between legs
-    legs = np.array([p.block == "legs" for p in case.pairs])
-    over = np.where(legs, np.maximum(over, left - ALLOWED_EXCESS), over)
+    # no rows of the solve know what the skin shows between legs; as little as need be, since a stance widens for it
+    legs = np.array([p.block == "legs" for p in case.pairs]) & (left > NEARLY * TOLERANCE)
+    over = np.where(legs, np.maximum(over, (left - NEARLY * TOLERANCE / 2) / 2), over)
     over = np.where(left > ENOUGH * TOLERANCE, over, 0.0)
     return [tighten(s, over[:, s.columns], float(case.seen.motion.dt)) for s in stages]
 
