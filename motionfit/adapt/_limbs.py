@@ -43,6 +43,7 @@ LIMBS = ("arms", "legs")
 RATE = 30.0  # [1/s] of the frames that the solver sees: three for every knot
 MARGIN = 0.001  # [m]
 DOUBTFUL = 0.003  # [m] between two looks, where there may be a centimetre
+FAINT = 0.015  # [m] of a phantom that is lost along with what is there, and left on the volumes under the tolerance
 DOUBTED = 0.02  # [m] on the fields of a shoulder that shows nothing on the skin
 MOST_JERK = 1.04  # ratio to the source's
 CALM = 2.0  # knots over which a correction that is too jerky is smoothed before it is solved again
@@ -246,6 +247,8 @@ def _quiet(
     quiet = (clear & quiet) | lone
     arm_of = np.array([p.first.partition("_")[0] if p.block == "arms" else p.block for p in pairs])
     lone &= (most <= DOUBTED) & np.isin(arm_of, arm_of[~quiet])
+    faint = phantom.max(axis=0) <= FAINT
+    phantom = np.where(faint, np.minimum(phantom, ENOUGH * TOLERANCE - MARGIN - ALLOWED_EXCESS), phantom)
     return quiet & ~lone, np.where(lone, own + ENOUGH * TOLERANCE - MARGIN, kept), np.where(lone, 0.0, phantom)
 
 
