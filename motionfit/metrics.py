@@ -67,7 +67,9 @@ def skin_depths(
     for i, (_, _, found) in enumerate(insides(character, looked[np.array(new, int)], pairs), 1):
         known[poses[new[i - 1]]] = shown_in(found, len(pairs))
         if progress is not None:
-            progress(i, len(new))
+            progress(len(frames) - len(new) + i, len(frames))
+    if progress is not None and not new:
+        progress(len(frames), len(frames))
     result = np.array([known[pose].depth for pose in poses]).reshape(len(frames), len(pairs))
     probed = max(sum(len(v) for v in _probed(character, pairs).values()), 1)
     return SkinDepths(result, sum(known[pose].inside for pose in poses) / (probed * max(len(frames), 1)), frames)

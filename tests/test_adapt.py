@@ -280,12 +280,18 @@ def test_what_the_skin_never_showed_is_not_made_worse(shared_data):
     assert after.max() < 0.01
 
 
+def _recorded(shared_data, clip, body):
+    """A recorded clip, a body, and the one that the clips were made for."""
+    folder = shared_data / "characters"
+    bodies = (mf.load_character(folder / f"{name}.glb") for name in (body, "avg_male"))
+    return mf.load_motion(shared_data / "bvh" / clip), *bodies
+
+
 def test_a_phantom_between_thighs_moves_no_leg(shared_data):
     """In a pirouette the fields see thighs 2.6 cm in each other that never touch. They came 14 degrees apart for it,
     over four seconds, and the zero-moment point left its support by half a metre."""
-    clip = mf.load_motion(shared_data / "bvh" / "05_11_sideways_steps_pirouette.bvh")[1:481]
-    dancer, reference = (mf.load_character(shared_data / "characters" / f"{n}.glb")
-                         for n in ("athletic_female", "avg_male"))  # fmt: skip
+    clip, dancer, reference = _recorded(shared_data, "05_11_sideways_steps_pirouette.bvh", "athletic_female")
+    clip = clip[1:481]
     fit = mf.adapt(clip, dancer, reference=reference, blocks=("legs",))
     own = skin_depths(reference, mf.onto(clip, reference.skeleton), step=4).depth
     before, after = (skin_depths(dancer, m, step=4).depth - own for m in (fit.base, fit.motion))
@@ -296,9 +302,8 @@ def test_a_phantom_between_thighs_moves_no_leg(shared_data):
 
 def test_a_fold_that_yields_late_is_pressed_until_it_does(shared_data):
     """A raised arm of a heavy dancer, whose fields and skin pull apart."""
-    clip = mf.load_motion(shared_data / "bvh" / "05_02_dance_arms_pirouette.bvh")[709:949]
-    heavy_male, reference = (mf.load_character(shared_data / "characters" / f"{n}.glb")
-                             for n in ("heavy_male", "avg_male"))  # fmt: skip
+    clip, heavy_male, reference = _recorded(shared_data, "05_02_dance_arms_pirouette.bvh", "heavy_male")
+    clip = clip[709:949]
     fit = mf.adapt(clip, heavy_male, reference=reference, blocks=("arms",))
     own = skin_depths(reference, mf.onto(clip, reference.skeleton), step=4).depth
     before, after = (skin_depths(heavy_male, m, step=4).depth - own for m in (fit.base, fit.motion))
