@@ -22,7 +22,7 @@ from motionfit._motion import Motion, resample
 from motionfit.adapt import build_clearance, reference_depths, volume_depths
 from motionfit.adapt._clearance import probe_depths, reduced, support
 from motionfit.adapt._controls import arm_controls
-from motionfit.adapt._limbs import SOLVE_PROBES, jerk_scale
+from motionfit.adapt._stages import SOLVE_PROBES, jerk_scale
 from motionfit.metrics import TOLERANCE, derivative_ratio
 from motionfit.shape.pairs import pairs_of
 from motionfit.splines import Basis, bspline_basis, knots_at_extrema, knots_basis, refined_knots
