@@ -7,14 +7,17 @@ import sys
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import motionfit as mf
 from benchmarks.metrics import compilations
 from motionfit import samples
-from motionfit._motion import Motion, host_kinematics, joint_angles, resample
+from motionfit._control import Correction
+from motionfit._motion import Motion, host_kinematics, joint_angles, resample, rest_motion
 from motionfit.adapt._clearance import build_clearance, probe_depths, support
-from motionfit.adapt._controls import arm_controls
+from motionfit.adapt._controls import arm_controls, leg_controls
 from motionfit.adapt._stages import own_sets, stages_of
 from motionfit.metrics import derivative_ratio, skin_depths
 from motionfit.shape.growth import grow
@@ -253,6 +256,34 @@ def test_an_arm_that_points_away_from_the_trunk_keeps_its_axes(average):
     ends = np.r_[0:15, frames - 15 : frames]
     assert ((axes["left_arm"] * away).sum(1)[ends] > 0.98).all()
     assert np.abs((axes["left_arm"] * axes["left_arm_twist"]).sum(1)).max() < 1e-9
+
+
+@given(angle=st.floats(-0.7, 0.7), seed=st.integers(0, 99))
+@settings(max_examples=20, deadline=None)
+def test_knees_come_apart_over_feet_that_stay(average, angle, seed):
+    """Hip and ankle lie on the axis, so that neither moves, nor does the foot turn; a bent knee goes out by its distance
+    from that line times the sine of the angle."""
+    rest = rest_motion(average.skeleton)
+    rotations, random = np.array(rest.rotations, float), np.random.default_rng(seed)
+    for joint in (average.skeleton.joint(f"{s}_{r}") for s in ("left", "right") for r in ("thigh", "calf")):
+        bend = Rotation.from_rotvec(random.uniform(-1.0, 1.0, 3))
+        rotations[0, joint] = (bend * Rotation.from_quat(rotations[0, joint], scalar_first=True)).as_quat(
+            scalar_first=True
+        )
+    pose = dataclasses.replace(rest, rotations=rotations)[np.zeros(16, int)]
+    controls = leg_controls(average, pose, bspline_basis(pose.frame_count, float(pose.dt), 0.1))
+    knees = Correction(controls[2:], (np.full(controls[2].basis.count, angle),))
+    (before, turns), (after, turned) = (host_kinematics(m) for m in (pose, knees.apply(pose)))
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        hip, knee, foot = (average.skeleton.joint(f"{side}_{r}") for r in ("thigh", "calf", "foot"))
+        np.testing.assert_allclose(after[:, foot], before[:, foot], atol=1e-6)
+        np.testing.assert_allclose(np.abs((turned[:, foot] * turns[:, foot]).sum(-1)), 1.0, atol=1e-9)
+        line = before[:, hip] - before[:, foot]
+        line /= np.linalg.norm(line, axis=-1, keepdims=True)
+        arm = before[:, knee] - before[:, foot]
+        arm -= (arm * line).sum(-1, keepdims=True) * line
+        wanted = np.cos(angle) * arm + sign * np.sin(angle) * np.cross(line, arm)
+        np.testing.assert_allclose(after[:, knee] - before[:, knee], wanted - arm, atol=1e-6)
 
 
 def test_what_touches_at_a_grown_armpit_comes_out(shared_data):

@@ -44,12 +44,13 @@ def arm_controls(character: Character, motion: Motion, basis: Basis) -> tuple[Co
     return tuple(controls)
 
 
-def leg_controls(character: Character, motion: Motion, basis: Basis) -> tuple[Control, Control]:
-    """The hip x and the opposite thighs y of thesis 4.5.
+def leg_controls(character: Character, motion: Motion, basis: Basis) -> tuple[Control, Control, Control]:
+    """The hip x and the opposite thighs y of thesis 4.5, and the knees.
 
     `hip_turn` turns the hips about the vertical while the thighs turn back, so that the legs keep their
     orientation; `thighs_apart` turns the thighs by opposite angles about the pelvis's forward axis, positive
-    apart.
+    apart. `knees_apart` turns each leg about the line from its ankle to its hip, positive apart, and the foot back: in a
+    squat or a step the thighs make room for each other, and the feet stay where they are.
     """
     skeleton = character.skeleton
     positions, world = host_kinematics(motion)
@@ -62,8 +63,14 @@ def leg_controls(character: Character, motion: Motion, basis: Basis) -> tuple[Co
         Drive(j, _in_parent(skeleton, world, j, up), gain) for j, gain in ((hips, 1.0), (left, -1.0), (right, -1.0))
     )
     apart = tuple(Drive(j, _in_parent(skeleton, world, j, forward), gain) for j, gain in ((left, 1.0), (right, -1.0)))
+    knees = []
+    for side, gain in zip(SIDES, (1.0, -1.0), strict=True):
+        thigh, foot = (skeleton.joint(f"{side}_{r}") for r in ("thigh", "foot"))
+        line = _smooth(positions[:, thigh] - positions[:, foot], motion)
+        knees += [Drive(j, _in_parent(skeleton, world, j, line), g) for j, g in ((thigh, gain), (foot, -gain))]
     return (Control("hip_turn", turn, basis, -np.pi / 8, np.pi / 8),
-            Control("thighs_apart", apart, basis, -np.pi / 4, np.pi / 4))  # fmt: skip
+            Control("thighs_apart", apart, basis, -np.pi / 4, np.pi / 4),
+            Control("knees_apart", tuple(knees), basis, -np.pi / 4, np.pi / 4))  # fmt: skip
 
 
 def lean_controls(

@@ -25,12 +25,13 @@ SOLVE_PROBES = {"upper_arm": 20, "forearm": 16, "hand": 12, "thigh": 20, "calf":
 # [m] that may stay where more was; well under TOLERANCE, which the skin is judged by: much that is in a little adds up
 # too, and a body that leans and comes down to balance brings its thighs some 2 mm nearer
 ALLOWED_EXCESS = 0.002
-LEAST_GAP = 0.005  # [m]
+LEAST_GAP, LEAST_GAP_OF_LEGS = 0.005, 0.03  # [m]: of legs no rows but the fields' know what the skin shows
 # Across and twist are there for what r alone cannot do, and the skin around a shoulder is known least where it twists
 SIGMA_EFFORT = {
     **{f"{side}_arm{kind}": sigma for side in SIDES for kind, sigma in (("", 1.0), ("_across", 1.0), ("_twist", 0.4))},
     "hip_turn": 0.1,
     "thighs_apart": 1.0,
+    "knees_apart": 1.0,
 }  # [rad]
 SIGMA_PACE = {"hip_turn": 0.3, "thighs_apart": 0.3}  # [rad/s]: a stance may widen over seconds, not within a step
 JERK_SHARE = 4.0  # of the hands' own jerk, what the correction may add at the cost of 1 per frame
@@ -126,7 +127,9 @@ def stages_of(
             wanted = [(f"{s}_arm", tuple(f"{s}_arm{k}" for k in ("", "_across", "_twist")),
                        tuple(p for p in pairs if p.block == "arms" and p.first.startswith(s))) for s in SIDES]  # fmt: skip
         else:
-            wanted = [("legs", ("hip_turn", "thighs_apart"), tuple(p for p in pairs if p.block == "legs"))]
+            wanted = [
+                ("legs", ("hip_turn", "thighs_apart", "knees_apart"), tuple(p for p in pairs if p.block == "legs"))
+            ]
         for name, controls, mine in wanted:
             clearance = build_clearance(character, mine, objective)
             columns = [pairs.index(p) for p in clearance.pairs]
@@ -158,8 +161,8 @@ def problem_of(
         allowed = in_order(stages, [s.allowed + s.phantom for s in stages])
         scores = np.sum([support(everything, depth, allowed) for depth in probes], axis=0)
     for stage in stages:
-        # however much the skin shows: a part that is LEAST_GAP away from the other's field is pushed no further
-        limit = np.maximum(stage.allowed, -LEAST_GAP)
+        # however much the skin shows: an arm that is LEAST_GAP away from the other's field is pushed no further by it
+        limit = np.maximum(stage.allowed, -LEAST_GAP if stage.block.name != "legs" else -LEAST_GAP_OF_LEGS)
         limit = np.where(stage.quiet, stage.allowed, smooth_floor(limit, float(seen.motion.dt)) + stage.phantom)
         # the frames that only fill the bucket cost nothing
         limit = np.concatenate([limit, np.full((length - real, limit.shape[1]), 1e3)])
