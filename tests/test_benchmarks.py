@@ -2,15 +2,18 @@
 
 import importlib.util
 import json
+import pathlib
 
 import jax
 import numpy as np
 import pytest
 
+import motionfit as mf
 from benchmarks import __main__ as command
-from benchmarks import finite_differences, metrics, peers, workloads
+from benchmarks import finite_differences, metrics, peers, profile, workloads
 from benchmarks.metrics import BASELINE, FIELDS, Metric, compare, interleaved, load_baseline, save_baseline
 from benchmarks.workloads import Entry, Skip
+from motionfit import samples
 
 
 def _table(**changes):
@@ -258,3 +261,16 @@ def test_peer_work_is_judged_by_the_allowed_depth():
     row = peers.untouched(work)
     assert row.worst_m > 0.01 and row.over_1cm == 1.0 and row.deviation_rad == 0.0
     assert "untouched" in peers.table([row])
+
+
+@pytest.mark.slow
+def test_a_profile_finds_every_block_and_kind_of_work(heavy, average):
+    """They are found by name: one that is called otherwise some day would silently take no time."""
+    total, spent = profile.profiled(samples.walk(cycles=1), heavy, average)
+    absent = {"collisions", "gaps of touches"}  # no hand touches anything
+    assert {name for name, seconds in spent.items() if seconds == 0.0} == absent
+    for some in (profile.BLOCKS, profile.WORK):
+        assert 0.5 * total < sum(spent[name] for name in some) <= total
+    for name in absent:
+        file, function = {**profile.BLOCKS, **profile.WORK}[name]
+        assert any(f"\ndef {function}(" in p.read_text() for p in pathlib.Path(mf.__file__ or "").parent.rglob(file))

@@ -56,6 +56,7 @@ class SkinLooks:
     def __init__(self, clip: Motion, character: Character, reference: Character | None, pairs: tuple[Pair, ...]):
         """`clip` is what the reference plays, in the frames that the solver sees."""
         self.clip, self.character, self.reference, self.pairs = clip, character, reference, pairs
+        self.original = None if reference is None else onto(clip, reference.skeleton)
         self.frames = np.arange(clip.frame_count)
         count = min(clip.frame_count, max(LEAST_LOOKS, round(clip.frame_count * LOOK_SHARE)))
         self.at: Int[np.ndarray, " looks"] = np.unique(np.linspace(0, clip.frame_count - 1, count).round().astype(int))
@@ -68,9 +69,9 @@ class SkinLooks:
 
     def _own(self, at: Int[np.ndarray, " some"]) -> Float[np.ndarray, "some pairs"]:
         """What the reference shows."""
-        if self.reference is None:
+        if self.reference is None or self.original is None:
             return np.zeros((len(at), len(self.pairs)))
-        return skin_depths(self.reference, onto(self.clip[at], self.reference.skeleton), self.pairs).depth
+        return skin_depths(self.reference, self.original[at], self.pairs).depth
 
     def anew(self) -> "SkinLooks":
         """Looks that start over, but look at no pose twice."""
