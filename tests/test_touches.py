@@ -11,7 +11,7 @@ from motionfit import samples
 from motionfit._motion import host_kinematics, rest_motion
 from motionfit.adapt._limits import Look, SkinLooks
 from motionfit.adapt._touches import KEPT, NEVER, NONE, touch_term, touches_of, touching_on
-from motionfit.metrics import insides, posed_vertices, skin_depths
+from motionfit.metrics import insides, posed_vertices, poses_of, skin_depths
 from motionfit.shape import grow
 from motionfit.shape.pairs import pairs_of
 from motionfit.shape.surface import inside_depths, part_surface
@@ -177,6 +177,19 @@ def test_what_is_clean_is_looked_at_in_between(shown, beside, taken):
     assert seen == {*range(0, 13, 2), *beside}
     assert looks.at.tolist() == sorted([0, 4, 8, 12, *taken])
     assert len(looks.own) == len(looks.deepest) == len(looks.eased) == len(looks.at)
+
+
+def test_what_is_let_be_is_told(heavy, average, monkeypatch):
+    """A single frame that sinks in is no reason to lead an arm out and back, but the status says so."""
+    looks, still = bare_looks([0, 4, 8], 9), rest_motion(samples.walk().skeleton)[np.zeros(9, int)]
+    looks._own = lambda at: np.full((len(at), 1), 0.02)
+    looks.seen = {(t, pose): Look(np.array([0.05 if t == 6 else 0.02]), NONE) for t, pose in enumerate(poses_of(still))}
+    assert not looks.look_between(still)
+    assert looks.most_seen(still) == pytest.approx(0.03)
+    walk = samples.walk(cycles=1)
+    assert mf.adapt(walk, heavy, reference=average, blocks=("legs",)).status == "converged"
+    monkeypatch.setattr(SkinLooks, "most_seen", lambda *_: 0.011)
+    assert mf.adapt(walk, heavy, reference=average, blocks=("legs",)).status == "violations_left"
 
 
 def test_no_pose_is_looked_at_twice(heavy, average, clip, monkeypatch):

@@ -188,11 +188,12 @@ def limbs(
         depths = volume_depths(everything, shown)
         left = case.left(depths, looks.depths(shown), quiet)
         best = best._replace(correction=worth, depths=depths, left=left.max(initial=0.0))
-    final = case.final(best.correction)
-    status = "violations_left" if best.left > TOLERANCE else "converged"
+    final, result = case.final(best.correction), case.moved(best.correction)
+    shown = 0.0 if looks is None else looks.most_seen(result[seen.frames])
+    status = "violations_left" if max(best.left, shown) > TOLERANCE else "converged"
     details = {"pairs": [p.name for p in case.pairs], "frames": seen.frames, "excess_before_m": before - own,
                "excess_after_m": best.depths - own, "held_back_m": best.held_back}  # fmt: skip
-    return Fit(final, final.apply(base), base, status, tuple(history), best.problem, details)  # pyright: ignore[reportArgumentType]
+    return Fit(final, result, base, status, tuple(history), best.problem, details)  # pyright: ignore[reportArgumentType]
 
 
 def _case(

@@ -168,6 +168,12 @@ class SkinLooks:
         self._look_at(missed.tolist())
         return True
 
+    def most_seen(self, motion: Motion) -> float:
+        """The greatest excess [m] of a motion in any frame in which it was looked at, also where it is let be."""
+        keys = zip(self.frames.tolist(), poses_of(motion), strict=True)
+        at = np.array([key[0] for key in keys if key in self.seen], int)
+        return float(self._excess(motion, at).max(initial=0.0))
+
     def _excess(self, motion: Motion, at: Int[np.ndarray, " some"]) -> Float[np.ndarray, " some"]:
         """The greatest excess [m] of any pair in some frames."""
         shown = [look.depths for look in self._look(motion, at).values()] if len(at) else []
