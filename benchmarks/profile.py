@@ -28,7 +28,7 @@ BLOCKS: Mapping[str, tuple[str, str]] = {
 }  # fmt: skip
 WORK: Mapping[str, tuple[str, str]] = {
     "looks: skinning": ("metrics.py", "posed_frames"), "looks: inside, how deep": ("surface.py", "find_inside"),
-    "looks: touches": ("_touches.py", "touches_of"), "gaps of touches": ("surface.py", "surface_gap"),
+    "looks: touches": ("_touches.py", "touches_of"), "gaps of touches": ("surface.py", "surface_gaps"),
     "fields": ("_clearance.py", "over_time"), "solves": ("_fit.py", "fit"), "clips onto bodies": ("_onto.py", "onto"),
 }  # fmt: skip
 

@@ -17,7 +17,7 @@ from motionfit._programs import program
 from motionfit._skinning import skin_points
 from motionfit._types import AnyArray
 from motionfit.shape.pairs import PAIRS, Pair
-from motionfit.shape.surface import Inside, find_inside, inside_depths, part_surface, surface_gap
+from motionfit.shape.surface import Inside, find_inside, inside_depths, part_surface, surface_gaps
 
 TOLERANCE = 0.01  # [m]: the "1 cm" of every frames_over_1cm
 SHOWN_KEPT = 100_000  # poses of which it is known what they show: some 40 MB
@@ -147,11 +147,22 @@ def skin_gaps(
     """How far [m] the skin of each pair's first part is from the second's surface: that of its nearest vertex, negative
     where one is inside. NaN where it is not `wanted` (None: it is everywhere)."""
     wanted = np.ones((motion.frame_count, len(pairs)), bool) if wanted is None else wanted
-    result, frames = np.full(wanted.shape, np.nan), np.flatnonzero(wanted.any(axis=1))
+    known, poses = character.memo.setdefault("gaps", {}), poses_of(motion)
+    if len(known) > SHOWN_KEPT:
+        known.clear()
+    asked = [[(pose, *pairs[k][:2]) for k in np.flatnonzero(row)] for pose, row in zip(poses, wanted, strict=True)]
+    frames = np.array([t for t, keys in enumerate(asked) if any(key not in known for key in keys)], int)
     for t, vertices in zip(frames, posed_frames(character, motion[frames]), strict=True):
-        for k in np.flatnonzero(wanted[t]).tolist():
-            points, surface = (part_surface(character, part) for part in pairs[k][:2])
-            result[t, k] = surface_gap(vertices[points.vertices], vertices[surface.used], surface.triangles)
+        by_surface: dict[str, list[tuple[bytes, str, str]]] = {}
+        for key in asked[t]:
+            if key not in known:
+                by_surface.setdefault(key[2], []).append(key)
+        for part, keys in by_surface.items():
+            surface = part_surface(character, part)
+            sets = [vertices[part_surface(character, first).vertices] for _, first, _ in keys]
+            known.update(zip(keys, surface_gaps(sets, vertices[surface.used], surface.triangles), strict=True))
+    result = np.full(wanted.shape, np.nan)
+    result[wanted] = [known[key] for keys in asked for key in keys]
     return result
 
 

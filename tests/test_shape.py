@@ -22,7 +22,7 @@ from motionfit.shape import grow, parse_girth
 from motionfit.shape.distance import capsule_depth, closest_on_lines, cylinder_depth, segment_distance
 from motionfit.shape.field import depths, fit_field, standing, standing_vertices
 from motionfit.shape.probes import make_probes
-from motionfit.shape.surface import inside_depths, may_be_inside, part_surface, surface_gap
+from motionfit.shape.surface import inside_depths, may_be_inside, part_surface, surface_gaps
 from motionfit.shape.volumes import fit_volumes
 from tests.helpers import central_difference
 
@@ -106,7 +106,7 @@ def test_a_field_tells_the_depth_below_the_skin(heavy):
 def test_a_point_over_the_middle_of_a_triangle_may_be_nearer_than_one_at_a_corner():
     box = trimesh.creation.box((1.0, 1.0, 1.0))
     points = np.array([[0.5, 0.5, 0.6], [0.2, 0.1, 0.55]])
-    assert abs(surface_gap(points, np.asarray(box.vertices), np.asarray(box.faces, np.int64)) - 0.05) < 1e-9
+    assert abs(surface_gaps([points], np.asarray(box.vertices), np.asarray(box.faces, np.int64))[0] - 0.05) < 1e-9
 
 
 @given(st.integers(0, 2**31), st.sampled_from(["torso", "left_upper_arm", "right_forearm", "left_thigh", "right_calf"]))
@@ -127,7 +127,7 @@ def test_inside_depths_are_those_of_all_triangles(heavy, seed, part):
     assert np.abs(inside_depths(points, vertices, surface.triangles) - wanted).max() < 1e-6
     for some, gap in ((~inside, distance[~inside].min(initial=np.inf)), (inside, -distance[inside].max(initial=0.0))):
         if some.any():
-            assert abs(surface_gap(points[some], vertices, surface.triangles) - gap) < 1e-6
+            assert abs(surface_gaps([points[some]], vertices, surface.triangles)[0] - gap) < 1e-6
 
 
 def test_a_field_moves_with_its_part(heavy, rng):

@@ -4,10 +4,12 @@ Generalised winding numbers and distances come from libigl, which builds a tree 
 posed body that takes far longer than to ask it, so what can be told by simpler means is not asked.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
 from motionfit._character import PARTS, Character
@@ -79,23 +81,33 @@ def inside_depths(
     return depth
 
 
-def surface_gap(
-    points: Float[np.ndarray, "points 3"], vertices: Float[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "t 3"]
-) -> float:
-    """How far [m] the nearest of some points is from a surface; where some are inside, how deep the deepest is, below
-    zero."""
+def surface_gaps(
+    sets: Sequence[Float[np.ndarray, "_ 3"]], vertices: Float[np.ndarray, "vertices 3"],
+    triangles: Int[np.ndarray, "t 3"],
+) -> list[float]:  # fmt: skip
+    """How far [m] the nearest of each set of points is from a surface; where some are inside, how deep the deepest is,
+    below zero."""
+    ends = np.cumsum([len(points) for points in sets])
+    found = find_inside(np.concatenate(sets), vertices, triangles)
+    cuts = np.searchsorted(found.points, ends)
+    depths = [found.depth[low:high] for low, high in zip([0, *cuts[:-1]], cuts, strict=True)]
+    near = KDTree(vertices)
+    return [-float(d.max()) if len(d) else _distance(points, near, vertices, triangles)
+            for d, points in zip(depths, sets, strict=True)]  # fmt: skip
+
+
+def _distance(
+    points: Float[np.ndarray, "points 3"], near: KDTree, vertices: Float[np.ndarray, "vertices 3"],
+    triangles: Int[np.ndarray, "t 3"],
+) -> float:  # fmt: skip
+    """Distance [m] of the nearest of some points, all outside, from a surface."""
     import igl
 
-    found = find_inside(points, vertices, triangles)
-    if len(found.points):
-        return -float(found.depth.max())
     # the nearest vertex says which points and triangles can be nearer yet
-    apart = cdist(points, vertices)
-    near = apart.min(axis=1)
-    bound = float(near.min())
+    apart = np.asarray(near.query(points)[0])
+    bound = float(apart.min())
     low, high = _spans(vertices, triangles)
-    longest = float(np.linalg.norm(high - low, axis=1).max())
-    some = near <= bound + longest
+    some = apart <= bound + float(np.linalg.norm(high - low, axis=1).max())
     box = points[some].min(axis=0) - bound, points[some].max(axis=0) + bound
     squared = igl.point_mesh_squared_distance(points[some], vertices, triangles[_overlap(low, high, *box)])[0]
     return float(np.sqrt(max(float(np.min(squared)), 0.0)))
