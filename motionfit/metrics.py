@@ -150,7 +150,9 @@ def skin_gaps(
     known, poses = character.memo.setdefault("gaps", {}), poses_of(motion)
     if len(known) > SHOWN_KEPT:
         known.clear()
-    asked = [[(pose, *pairs[k][:2]) for k in np.flatnonzero(row)] for pose, row in zip(poses, wanted, strict=True)]
+    asked = [
+        [(pose, *pairs[k][:2]) for k in np.flatnonzero(row).tolist()] for pose, row in zip(poses, wanted, strict=True)
+    ]
     frames = np.array([t for t, keys in enumerate(asked) if any(key not in known for key in keys)], int)
     for t, vertices in zip(frames, posed_frames(character, motion[frames]), strict=True):
         by_surface: dict[str, list[tuple[bytes, str, str]]] = {}
