@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from motionfit._character import Character
@@ -20,15 +20,16 @@ from motionfit._onto import onto
 from motionfit._problem import During, Problem
 from motionfit._skeleton import SIDES
 from motionfit._solve import Block
+from motionfit.adapt._asked import EVERY, NEAR, Asked, Wrong, cut, skin_gaps_near
 from motionfit.adapt._clearance import all_rows, build_clearance
-from motionfit.adapt._controls import Turn, turn_controls
+from motionfit.adapt._controls import turn_controls
 from motionfit.adapt._easing import between, eased, rougher, sinking_skin
 from motionfit.adapt._groups import GROUPS, Group, Known, Meetings, known_depths
 from motionfit.adapt._limits import NEARLY, SkinLooks
 from motionfit.adapt._record import on_top, put_down
-from motionfit.adapt._sampling import Sampling, sampling
+from motionfit.adapt._sampling import sampling
 from motionfit.adapt._stages import jerk_scale
-from motionfit.metrics import TOLERANCE, skin_depths, skin_gaps
+from motionfit.metrics import TOLERANCE, skin_gaps
 from motionfit.shape.pairs import PAIRS, Pair
 from motionfit.terms.pose import Effort, Smoothness
 
@@ -38,7 +39,6 @@ TOUCH = 0.02  # [m] from the surface: what counts as a touch on fields, and what
 TOUCHED = 0.01  # [m] on the reference's skin, which knows better
 TOUCH_AIM = 0.012  # [m] a touch is brought back to
 HELD = 0.016  # [m] a solve is content with: where an arm then sinks in, a touch gives way a little
-NEAR, EVERY = 0.06, 3  # [m] by the fields: where the skin is asked, in each third frame that is seen
 EASE = 0.08  # [s] within which a touch is taken up and let go
 EFFORT = 1.0  # [rad]
 ROUNDS, PATIENCE = 12, 3  # rounds at most, and without a better result
@@ -95,41 +95,6 @@ def _together(groups: Sequence[Group]) -> list[list[Group]]:
     return list(found.values())
 
 
-class Asked(NamedTuple):
-    """What is asked of a solve, per frame that it sees and row of `known`."""
-
-    character: Character
-    so_far: Fit
-    at: Sampling
-    known: Known
-    turns: tuple[Turn, ...]
-    own: Float[np.ndarray, "frames rows"]  # [m] of depth on the reference
-    allowed: Float[np.ndarray, "frames rows"]  # [m] of depth that a solve starts with
-    most: Float[np.ndarray, "frames rows"]  # [m] of depth that a result may show
-    touching: Bool[np.ndarray, "frames rows"]
-    by_skin: bool
-
-    @property
-    def small(self) -> Motion:
-        """The motion so far, in the frames that are seen."""
-        return self.at.motion(self.so_far.motion)
-
-    def gaps(self, of: Motion, depths: Float[np.ndarray, "frames rows"]) -> Float[np.ndarray, "frames rows"]:
-        """How far [m] what should touch is apart."""
-        if not self.by_skin:
-            return -depths
-        which = self.touching & self.known.on_skin
-        return skin_gaps_near(self.character, of, self.known.clearance.pairs, -depths, which)
-
-    def part(self, seen: slice, spacing: float, least: int) -> "Asked":
-        """What is asked in some of the frames that are seen, up to the next one after them."""
-        ends = np.append(self.at.frames, self.so_far.motion.frame_count)
-        so_far = cut(self.so_far, np.arange(int(ends[seen.start]), int(ends[seen.stop])))
-        own, allowed, most, touching = (x[seen] for x in (self.own, self.allowed, self.most, self.touching))
-        return self._replace(so_far=so_far, at=sampling(so_far.motion, spacing, least=least), own=own, allowed=allowed,
-                             most=most, touching=touching)  # fmt: skip
-
-
 def _solve(
     clip: Motion, character: Character, so_far: Fit, reference: Character | None, groups: list[Group],
     worth: Sequence[Pair] | None, tell: Callable[[float], None],
@@ -167,39 +132,6 @@ def _solve(
         looks.look_between(moved)
         status = "violations_left" if looks.most_seen(moved) > TOLERANCE else "converged"
     return dataclasses.replace(result, history=(*so_far.history, *history), status=status), told
-
-
-class Wrong(NamedTuple):
-    """What is wrong with a fit, per frame that is seen and row, and who shows what may stay: the clip on a reference."""
-
-    clip: Motion
-    reference: Character | None
-    worst: Float[np.ndarray, "frames rows"]  # [m] deeper than it may be
-    apart: Float[np.ndarray, "frames rows"]  # [m] farther than a touch
-    somewhere: Bool[np.ndarray, " frames"]
-
-    def looks(self, asked: Asked, seen: slice | np.ndarray) -> SkinLooks:
-        """Looks at the skin in some of the frames that are seen."""
-        return SkinLooks(self.clip[asked.at.frames[seen]], asked.character, self.reference, PAIRS)
-
-    def on_skin(self, asked: Asked, small: Motion) -> Int[np.ndarray, " some"]:
-        """The frames that are seen in which arms and legs show more than the tolerance on the skin."""
-        looks = self.looks(asked, slice(None))
-        looks.look_between(small)
-        return looks.at[(looks.depths(small) - looks.own > TOLERANCE).any(axis=1)]
-
-    def shown(self, asked: Asked, small: Motion, over: Bool[np.ndarray, "frames rows"]) -> bool:
-        """Whether the skin shows what the fields say is `over` the tolerance; spheres have none."""
-        rows = np.flatnonzero(over.any(axis=0) & asked.known.on_skin)
-        frames = np.flatnonzero(over[:, rows].any(axis=1))
-        if over[:, ~asked.known.on_skin].any() or not len(frames):
-            return bool(over[:, ~asked.known.on_skin].any())
-        pairs = tuple(asked.known.clearance.pairs[row] for row in rows)
-        body = self.reference or asked.character
-        played = asked.so_far.base if self.reference is None else onto(self.clip, body.skeleton)
-        own, now = (skin_depths(b, m[frames], pairs).depth
-                    for b, m in ((body, asked.at.motion(played)), (asked.character, small)))  # fmt: skip
-        return bool(((now - own > TOLERANCE) & over[np.ix_(frames, rows)]).any())
 
 
 class Outcome(NamedTuple):
@@ -327,12 +259,6 @@ def _put_in(asked: Asked, parts: list[Fit], windows: list[slice]) -> Fit:
         whole[start : start + frames] = rotations
     motion = dataclasses.replace(so_far.motion, rotations=whole)
     return put_down("collisions", so_far, motion, so_far.base, so_far.correction, sorted(joints)) if joints else so_far
-
-
-def cut(fit: Fit, frames: np.ndarray) -> Fit:
-    """Some frames of a fit, with the correction that it has there."""
-    correction = Correction(tuple(c[frames] for c in fit.correction.controls), fit.correction.points)
-    return dataclasses.replace(fit, correction=correction, motion=fit.motion[frames], base=fit.base[frames])
 
 
 class Shown(NamedTuple):
@@ -478,21 +404,6 @@ def _shown(
     if body is None:
         return own, hands & (own > -TOUCH)
     return own, hands & (skin_gaps_near(body, motion, pairs, -own, known.on_skin) < TOUCHED)
-
-
-def skin_gaps_near(
-    character: Character, motion: Motion, pairs: Sequence[Pair], by_field: Float[np.ndarray, "frames rows"],
-    which: Bool[np.ndarray, "*frames rows"],
-) -> Float[np.ndarray, "frames rows"]:  # fmt: skip
-    """How far [m] the first parts are from the second: what the fields say, corrected by what the skin shows, of the
-    rows `which`, in some of the frames in which they are near."""
-    wanted = which & (by_field < NEAR)
-    wanted[np.arange(len(wanted)) % EVERY != 0] = False
-    shown, frames, result = skin_gaps(character, motion, pairs, wanted), np.arange(len(wanted)), by_field.copy()
-    for k in np.flatnonzero(wanted.any(axis=0)):
-        asked = np.flatnonzero(wanted[:, k])
-        result[:, k] += np.interp(frames, asked, (shown - by_field)[asked, k])
-    return result
 
 
 def _faults(
