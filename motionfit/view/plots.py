@@ -137,7 +137,7 @@ def _draw_curve(axes, motion: Motion, before, after, name: str, top: float, inde
     axes.plot(seconds, 100 * np.maximum(after, 0), color="#1b6e3c", label="after")
     axes.axhline(100 * TOLERANCE, color="0.5", linewidth=0.8, linestyle="--")
     axes.set_ylim(0, top)
-    axes.set_title(name.replace("_", " ").replace("/", " in "), fontsize=10)
+    axes.set_title(name.replace("_", " ").replace("/", " in "), fontsize=10, loc="left")
     axes.tick_params(labelsize=8)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
@@ -145,4 +145,4 @@ def _draw_curve(axes, motion: Motion, before, after, name: str, top: float, inde
         axes.set_ylabel("excess [cm]", fontsize=9)
     axes.set_xlabel("time [s]", fontsize=9)
     if index == 0:
-        axes.legend(fontsize=8, frameon=False)
+        axes.legend(fontsize=8, frameon=False, loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=2)  # over no curve
