@@ -31,7 +31,7 @@ SIGMA_EFFORT = {
     **{f"{side}_arm{kind}": sigma for side in SIDES for kind, sigma in (("", 1.0), ("_across", 1.0), ("_twist", 0.4))},
     "hip_turn": 0.1,
     "thighs_apart": 1.0,
-    "knees_apart": 1.0,
+    "knees_apart": 0.6,
 }  # [rad]
 SIGMA_PACE = {"hip_turn": 0.3, "thighs_apart": 0.3}  # [rad/s]: a stance may widen over seconds, not within a step
 JERK_SHARE = 4.0  # of the hands' own jerk, what the correction may add at the cost of 1 per frame
