@@ -17,10 +17,11 @@ import motionfit as mf
 from motionfit import samples
 from motionfit._character import PARTS
 from motionfit._motion import bind_pose
-from motionfit.metrics import posed_vertices
+from motionfit.metrics import posed_vertices, skin_gaps
 from motionfit.shape import grow, parse_girth
 from motionfit.shape.distance import capsule_depth, closest_on_lines, cylinder_depth, segment_distance
 from motionfit.shape.field import depths, fit_field, standing, standing_vertices
+from motionfit.shape.pairs import Pair
 from motionfit.shape.probes import make_probes
 from motionfit.shape.surface import inside_depths, may_be_inside, part_surface, surface_gaps
 from motionfit.shape.volumes import fit_volumes
@@ -128,6 +129,23 @@ def test_inside_depths_are_those_of_all_triangles(heavy, seed, part):
     for some, gap in ((~inside, distance[~inside].min(initial=np.inf)), (inside, -distance[inside].max(initial=0.0))):
         if some.any():
             assert abs(surface_gaps([points[some]], vertices, surface.triangles)[0] - gap) < 1e-6
+
+
+def test_gaps_of_a_motion_are_those_of_each_pose_and_pair(heavy):
+    """Pairs of one surface share its tree, and what was measured before is kept: by pose, and only what was asked for."""
+    motion = mf.onto(samples.walk(cycles=1), heavy.skeleton)[:60:20]
+    pairs = tuple(
+        Pair(*names, "") for names in (("left_hand", "torso"), ("right_hand", "torso"), ("left_hand", "head"))
+    )
+    wanted = np.array([[True, True, False], [True, False, True], [False, False, False]])
+    some, everywhere = skin_gaps(heavy, motion, pairs, wanted), skin_gaps(heavy, motion, pairs)
+    assert np.array_equal(np.isnan(some), ~wanted) and np.array_equal(some[wanted], everywhere[wanted])
+    for t, posed in enumerate(posed_vertices(heavy, motion).astype(float)):
+        for k, pair in enumerate(pairs):
+            surface = part_surface(heavy, pair.second)
+            points = posed[part_surface(heavy, pair.first).vertices]
+            alone = surface_gaps([points], posed[surface.used], surface.triangles)
+            assert everywhere[t, k] == pytest.approx(alone[0], abs=1e-6)
 
 
 def test_a_field_moves_with_its_part(heavy, rng):

@@ -69,7 +69,7 @@ class SkinLooks:
 
     def _own(self, at: Int[np.ndarray, " some"]) -> Float[np.ndarray, "some pairs"]:
         """What the reference shows."""
-        if self.reference is None or self.original is None:
+        if self.reference is None or self.original is None:  # both or neither
             return np.zeros((len(at), len(self.pairs)))
         return skin_depths(self.reference, self.original[at], self.pairs).depth
 
