@@ -102,7 +102,7 @@ def shown_in(found: Mapping["Direction", Inside], pairs: int) -> Shown:
 def poses_of(motion: Motion) -> list[bytes]:
     """What tells frames apart by what their skin shows: where a body stands does not matter."""
     arrays = [motion.rotations, *(() if motion.translations is None else (motion.translations,))]
-    rows = [np.ascontiguousarray(np.asarray(x)).reshape(motion.frame_count, -1) for x in arrays]
+    rows = [np.asarray(x) for x in arrays]
     return [hashlib.sha256(b"".join(r[t].tobytes() for r in rows)).digest() for t in range(motion.frame_count)]
 
 

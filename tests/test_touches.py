@@ -114,6 +114,7 @@ def bare_looks(at, frames, own=0.0):
     looks = object.__new__(SkinLooks)  # what it decides by, without a body
     looks.at, looks.frames, looks.pairs = np.array(at), np.arange(frames), PAIRS[:1]
     looks.own, looks.deepest, looks.eased = np.full((len(at), 1), own), *(np.zeros((len(at), 1)) for _ in range(2))
+    looks.let_be = np.zeros(0, int)
     return looks
 
 
@@ -157,8 +158,9 @@ def test_afterwards_only_what_comes_near_is_looked_at_again():
     ({}, [], []),
     ({6: 0.95, 7: 0.92}, [5, 7], [6, 7]),
     ({9: 0.75, 10: 0.95, 11: 0.65}, [9, 11], [9, 10]),  # a hump, of which the solver is to see the flank
+    ({6: 2.0}, [5, 7], [6]),
     ({6: 3.0}, [5, 7], []),  # an arm would have to be led out and back for it
-    ({0: 0.75, 1: 2.0, 2: 0.95, 6: 0.95}, [1, 3, 5, 7], [1, 2]),
+    ({0: 0.75, 1: 2.0, 2: 0.95, 6: 0.95}, [1, 3, 5, 7], [1, 2, 6]),
     ({4: 0.95, 5: 1.1}, [3, 5], [5]),  # beside a look
     ({4: 0.95, 5: 0.8}, [3, 5], []),  # which shows the most of it
     ({3: 3.0}, [], []),  # between two frames that show nothing
@@ -186,6 +188,12 @@ def test_what_is_let_be_is_told(heavy, average, monkeypatch):
     looks.seen = {(t, pose): Look(np.array([0.05 if t == 6 else 0.02]), NONE) for t, pose in enumerate(poses_of(still))}
     assert not looks.look_between(still)
     assert looks.most_seen(still) == pytest.approx(0.03)
+    # and where a later round moved it, it is looked at again
+    looked = []
+    looks._look = lambda motion, at: looked.extend(at.tolist()) or {}
+    moved = dataclasses.replace(still, rotations=-np.asarray(still.rotations))  # no pose that was seen
+    looks.most_seen(moved)
+    assert looked == [6]
     walk = samples.walk(cycles=1)
     assert mf.adapt(walk, heavy, reference=average, blocks=("legs",)).status == "converged"
     monkeypatch.setattr(SkinLooks, "most_seen", lambda *_: 0.011)

@@ -21,7 +21,7 @@ from motionfit._solve import Block
 from motionfit._types import InputError
 from motionfit.adapt._clearance import build_clearance, volume_depths
 from motionfit.adapt._controls import lean_controls
-from motionfit.adapt._limits import NEARLY, reference_depths
+from motionfit.adapt._limits import MOST_JERK, NEARLY, reference_depths
 from motionfit.adapt._record import put_down
 from motionfit.adapt._sampling import Sampling, sampling
 from motionfit.adapt._standing import distances, weighed
@@ -42,7 +42,6 @@ EFFORT = 0.3  # [rad]
 JERK_SHARE = 0.5  # of the source's own jerk, what the hips may get at the cost of 1 per frame
 LEAST_JERK = 10.0  # [m/s^3] for clips that stand still
 LEVER = 0.9  # [m] ankle to hip
-MOST_JERK = 1.04  # ratio to that of the motion before the block
 PASS_OVER = 0.08  # [s] within which the weight goes from one foot to the other
 STRETCH = 0.998  # of a leg's length, as far as it may be stretched: straight legs leave no way to shift the hips
 ROUNDS, PATIENCE = 5, 2  # rounds at most, and rounds without a better result

@@ -10,14 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from motionfit._fit import Fit
 from motionfit._motion import Motion
-from motionfit.adapt._limits import NEARLY, SkinLooks
+from motionfit.adapt._limits import MOST_JERK, NEARLY, SkinLooks
 from motionfit.adapt._record import put_down
 from motionfit.adapt._sampling import Sampling
 from motionfit.metrics import TOLERANCE, derivative_ratio
 
 SLOPE = 0.08  # [s] of the Gaussian that a share rises and falls by
 YIELDS = 0.2  # [s] around what sinks in, in which a correction gives way
-MOST_JERK = 1.04
 GIVES = (0.1, 0.2, 0.3, *(0.5,) * 5)  # of what sinks in, one after the other: a touch bears little of it
 
 

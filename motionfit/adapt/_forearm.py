@@ -21,7 +21,7 @@ from motionfit.adapt._clearance import probe_depths, reduced, support
 from motionfit.adapt._controls import Turn, turn_controls
 from motionfit.adapt._easing import eased, sinking_skin
 from motionfit.adapt._groups import Group, filled, known_depths
-from motionfit.adapt._limits import SkinLooks
+from motionfit.adapt._limits import MOST_JERK, SkinLooks
 from motionfit.adapt._record import on_top, put_down
 from motionfit.adapt._sampling import sampling
 from motionfit.adapt._stages import SOLVE_PROBES, jerk_scale, smooth_floor
@@ -34,7 +34,6 @@ STARTS = 10  # of them are refined
 ALLOWED_EXCESS = 0.004  # [m] that may stay
 EFFORT = 2.0  # [rad]
 CLEAR = 0.02  # [rad] on the mean: forearms that point where they did are left alone
-MOST_JERK = 1.04
 ROUNDS = 4
 
 

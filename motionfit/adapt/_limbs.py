@@ -17,7 +17,7 @@ from motionfit._problem import Problem
 from motionfit._types import InputError
 from motionfit.adapt._clearance import allowance, build_clearance, probe_depths, volume_depths
 from motionfit.adapt._controls import arm_controls, leg_controls
-from motionfit.adapt._limits import ENOUGH, NEARLY, SkinLooks, reference_depths
+from motionfit.adapt._limits import ENOUGH, MOST_JERK, NEARLY, SkinLooks, reference_depths
 from motionfit.adapt._sampling import sampling
 from motionfit.adapt._stages import (
     ALLOWED_EXCESS,
@@ -45,12 +45,12 @@ MARGIN = 0.001  # [m]
 DOUBTFUL = 0.003  # [m] between two looks, where there may be a centimetre
 FAINT = 0.015  # [m] of a phantom that is lost along with what is there, and left on the volumes under the tolerance
 DOUBTED = 0.02  # [m] on the fields of a shoulder that shows nothing on the skin
-MOST_JERK = 1.04  # ratio to the source's
 CALM = 2.0  # knots over which a correction that is too jerky is smoothed before it is solved again
 WIDE = np.deg2rad(45.0)  # a turn that makes one look for a shorter way out
 # out, out and across: where an arm lies deep in a trunk or before it, each way out has a valley of its own
 STARTS = tuple(np.deg2rad(s) for s in ((30.0, 0.0, 0.0), (30.0, 30.0, 30.0), (30.0, -30.0, -30.0)))
 ROUNDS, PATIENCE = 9, 2  # rounds at most, and rounds without a better result
+LONGER, MANY_FAULTS = 15, 0.01  # rounds at most of a result that still gets better and has more faults than that
 FEW_FAULTS = 0.005
 DONE = 0.5  # of what the source shows on a body: what a block leaves at most that has done its work
 LESS = 0.8  # of the mean square of all turns: a tenth of the turns themselves
@@ -132,7 +132,7 @@ def limbs(
     smooth, history, since, easing, on_skin, missed = jerk_scale(base), [], 0, False, None, False
     best = Iterate(np.inf, correction, None, before, held_back, np.inf)
 
-    for round_ in range(ROUNDS):
+    for round_ in range(LONGER):
         problem = problem_of(case, stages, smooth, (at_first, probes))
         result = fit(problem, together(stages, seen), sweeps, correction=correction,
                      progress=_told(progress, round_, sweeps * len(stages)))  # fmt: skip
@@ -149,7 +149,8 @@ def limbs(
                 looks.look_closer((after - own).max(axis=1))
             on_skin, missed = looks.depths_and_touches(moved), False
             clean = bool((on_skin <= looks.own + TOLERANCE).all())
-            late = since >= PATIENCE or round_ >= ROUNDS - 1 - PATIENCE
+            most = ROUNDS if best.faults < MANY_FAULTS else LONGER
+            late = since >= PATIENCE or round_ >= most - 1 - PATIENCE
             if round_ >= CLOSER[-1] and (easing or not checked) and (clean or (late and not checked)):
                 # clean where it was looked at, or as clean as it gets: in between it is looked at once, and again where
                 # more may show since
@@ -173,7 +174,7 @@ def limbs(
             if looks is None or on_skin is None or not looks.ease(on_skin, ALLOWED_EXCESS):
                 break
             continue
-        if since > PATIENCE:
+        if since > PATIENCE or (round_ >= ROUNDS - 1 and (checked or looks is None) and best.faults < MANY_FAULTS):
             break
         if jerk > MOST_JERK:
             smooth *= 0.5
@@ -182,17 +183,18 @@ def limbs(
         if looks is not None and on_skin is not None and round_ > 0:  # what was found in a round counts in the next
             shown = np.max(np.where(quiet, 0.0, on_skin - looks.own), axis=0, initial=0.0) > ENOUGH * TOLERANCE
             stages = [stiffen(s) if shown[s.columns].any() else s for s in stages]
+    correction, depths, most_left = best.correction, best.depths, best.left
     if looks is not None and (best.left > TOLERANCE or known):
-        worth = _worth_it(case, best.correction, stages, first)
-        shown = case.moved(worth)[seen.frames]
-        depths = volume_depths(everything, shown)
-        left = case.left(depths, looks.depths(shown), quiet)
-        best = best._replace(correction=worth, depths=depths, left=left.max(initial=0.0))
-    final, result = case.final(best.correction), case.moved(best.correction)
-    shown = 0.0 if looks is None else looks.most_seen(result[seen.frames])
-    status = "violations_left" if max(best.left, shown) > TOLERANCE else "converged"
+        correction = _worth_it(case, best.correction, stages, first)
+        depths = volume_depths(everything, case.moved(correction)[seen.frames])
+    final, result = case.final(correction), case.moved(correction)
+    if looks is not None:  # where the fields say that there is something, the skin is asked
+        moved = result[seen.frames]
+        doubtful = case.left(depths, looks.depths(moved), quiet).max(axis=1, initial=0.0) > TOLERANCE
+        most_left = looks.most_seen(moved, doubtful)
+    status = "violations_left" if most_left > TOLERANCE else "converged"
     details = {"pairs": [p.name for p in case.pairs], "frames": seen.frames, "excess_before_m": before - own,
-               "excess_after_m": best.depths - own, "held_back_m": best.held_back}  # fmt: skip
+               "excess_after_m": depths - own, "held_back_m": best.held_back}  # fmt: skip
     return Fit(final, result, base, status, tuple(history), best.problem, details)  # pyright: ignore[reportArgumentType]
 
 
@@ -229,7 +231,7 @@ def _told(progress: Callable[[str, int, int], None] | None, round_: int, steps: 
     """The progress of one round of so many steps."""
     if progress is None:
         return None
-    return lambda name, done, _: progress(name, round_ * steps + done, ROUNDS * steps)
+    return lambda name, done, _: progress(name, min(round_ * steps + done, ROUNDS * steps), ROUNDS * steps)
 
 
 def _quiet(

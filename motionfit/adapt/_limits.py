@@ -16,9 +16,11 @@ from motionfit.shape.pairs import Pair
 from motionfit.terms.penetration import TouchClearance
 
 LEAST_LOOKS, LOOK_SHARE = 16, 1 / 15  # looks at the skin: at least, and per frame that the solver sees
+MOST_JERK = 1.04  # ratio of a result's to that of the motion before it
 NEARLY = 0.9  # of TOLERANCE: what a result may show, since between two looks there may be a little more
 LOOKS_APART = 2  # [frames] that two looks are at least apart
 EVERY = 2  # of the solver's frames, the one in which a result is looked at once
+FLEETING = 0.025  # [m] of excess in a single frame, from which on a limb passes too fast to be led out and back
 ENOUGH = 0.7  # of TOLERANCE: what a look may still show
 FARTHER = 0.005  # [m] out than need be, from which on touches are eased
 EASES = (0.5, 0.25, 0.0)  # of what was found, one after the other
@@ -66,6 +68,7 @@ class SkinLooks:
         self.found_in: dict[int, bytes] = {}  # the pose of the latest of them
         self.deepest = np.zeros_like(self.own)  # [m] of excess in any look, where touches were found
         self.eased = np.zeros_like(self.own)  # the share of it that touches may show again
+        self.let_be: Int[np.ndarray, " some"] = np.zeros(0, int)  # frames in which something fleeting was seen
 
     def _own(self, at: Int[np.ndarray, " some"]) -> Float[np.ndarray, "some pairs"]:
         """What the reference shows."""
@@ -153,31 +156,37 @@ class SkinLooks:
         """Look at a motion once in every second frame, unless not `everywhere`, and in all that may be `near` the
         tolerance; from now on where some show nearly as much. Says whether there are any.
 
-        What is there in a single frame is let be: where the fold of an armpit opens a frame later than the reference's,
-        an arm would have to be led out and back for it.
+        What is deep in a single frame is let be, and told: a hand that swings through a hip is out again before it
+        could be led around it, and what is tried for it spoils the frames beside it.
         """
         at = np.union1d(self.at, self.frames[::EVERY] if everywhere else [])
         at = np.union1d(at, [] if near is None else self.frames[near]).astype(int)
         over = at[self._excess(motion, at) > NEARLY * TOLERANCE]
         beside = np.intersect1d([over - 1, over + 1], self.frames)
         over = np.union1d(over, beside[self._excess(motion, beside) > ENOUGH * TOLERANCE])
-        lasting = over[np.isin(over - 1, over) | np.isin(over + 1, over)]
-        missed = np.setdiff1d(lasting, self.at)
+        lasting = np.isin(over - 1, over) | np.isin(over + 1, over) | (self._excess(motion, over) <= FLEETING)
+        self.let_be = np.union1d(self.let_be, over[~lasting]).astype(int)
+        missed = np.setdiff1d(over[lasting], self.at)
         if (self._excess(motion, missed) <= NEARLY * TOLERANCE).all():
             return False
         self._look_at(missed.tolist())
         return True
 
-    def most_seen(self, motion: Motion) -> float:
-        """The greatest excess [m] of a motion in any frame in which it was looked at, also where it is let be."""
+    def most_seen(self, motion: Motion, doubtful: Bool[np.ndarray, " frames"] | None = None) -> float:
+        """The greatest excess [m] of a motion in any frame in which it was looked at, where something is let be, and in
+        frames that are `doubtful`."""
+        self._look(motion, np.union1d(self.let_be, [] if doubtful is None else self.frames[doubtful]).astype(int))
         keys = zip(self.frames.tolist(), poses_of(motion), strict=True)
         at = np.array([key[0] for key in keys if key in self.seen], int)
         return float(self._excess(motion, at).max(initial=0.0))
 
     def _excess(self, motion: Motion, at: Int[np.ndarray, " some"]) -> Float[np.ndarray, " some"]:
-        """The greatest excess [m] of any pair in some frames."""
-        shown = [look.depths for look in self._look(motion, at).values()] if len(at) else []
-        return np.array([(d - own).max() for d, own in zip(shown, self._own(at), strict=True)] if shown else [])
+        """The greatest excess [m] of any pair in some frames; where nothing is deep, that depth, since the reference
+        can only make it less, and need not be looked at."""
+        shown = np.array([look.depths for look in self._look(motion, at).values()]).reshape(len(at), len(self.pairs))
+        deep = np.flatnonzero((shown > ENOUGH * TOLERANCE).any(axis=1))
+        shown[deep] -= self._own(at[deep])
+        return shown.max(axis=1, initial=-np.inf)
 
     def _look_at(self, frames: list[int]) -> None:
         if frames:
