@@ -354,13 +354,16 @@ class Attempt:
         gap, own = asked.gaps(moved, depths), self.looks.own
         may = np.maximum(self.looks.depths(asked.small) - own + ROOM, NEARLY * TOLERANCE)
         on_skin = self.looks.depths_and_touches(moved) - own - may
-        return Shown(probes, depths, gap, depths - asked.most, np.where(asked.touching, gap - HELD, 0.0), on_skin)
+        over = np.where(asked.touching, np.minimum(-gap, depths), depths) - asked.most  # a touch is judged by the skin
+        return Shown(probes, depths, gap, over, np.where(asked.touching, gap - HELD, 0.0), on_skin)
 
     def _solved(self) -> tuple[Fit, tuple]:
         at = self.asked.at
         rows = np.arange(len(at.rows))
         may = 0.0 if self.asked.by_skin else self.looks.depths(self.asked.small)
-        terms = {"collisions": self.meetings.term(self.allowed, self.gap - self.off, self.weight),
+        # a field that sees a touch where there is a gap is not to keep it, nor in the frames around
+        off = maximum_filter1d(np.maximum(self.off, 0.0), 2 * round(EASE / at.dt) + 1, axis=0)
+        terms = {"collisions": self.meetings.term(self.allowed + off, self.gap - self.off, self.weight),
                  "effort": During(Effort(EFFORT), (rows < len(at.frames)).astype(float)),
                  "smoothness": During(Smoothness(self.smooth), (rows < len(at.frames) - 2).astype(float)),
                  "skin": self.looks.touch_term(np.arange(len(PAIRS)), ALLOWED_EXCESS, len(at.rows), may)}  # fmt: skip
