@@ -5,8 +5,9 @@ python -m benchmarks.thesis.pipeline [--data FOLDER] [--bodies NAME ...] [--clip
 `motionfit.adapt` with its own blocks, for a clip made for avg_male. Per clip and body: the share of the frames with
 more than 1 cm of excess on the skin, before and after, the worst excess left [cm], the jerk's ratio to that of the clip,
 how far the carrying feet slide [cm], before and after, the mean distance of the zero-moment point from its support [cm]
-(SD), of the original on its own body and after, the mean change of the joints [degrees], and the time [s]. The thesis's
-figures are those of table 5.6. Each row is written as soon as it is there; `--resume` goes on after the rows of a run that was cut.
+(SD), of the original on its own body, before the balance block and after it, the mean change of the joints [degrees], and
+the time [s]. A body whose point is nearer than the original's before that block is left as it is. The thesis's figures
+are those of table 5.6. Each row is written as soon as it is there; `--resume` goes on after the rows of a run that was cut.
 A clip on a body that fails keeps its row, with the error as its status.
 """
 
@@ -35,7 +36,7 @@ BODIES = ("thin_male", "avg_female", "heavy_male", "tall_male")
 THESIS = {"walk": "Walk", "jump": "Jump", "hop": "Skip"}
 SKIN_LOOKS = 40  # per clip
 COLUMNS = ["clip", "body", "status", "skin %", "after", "worst [cm]", "jerk", "slide [cm]", "after", "ZMP original [cm]",
-           "after", "change [deg]", "time [s]"]  # fmt: skip
+           "corrected", "balanced", "change [deg]", "time [s]"]  # fmt: skip
 
 
 def row(clip: Motion, character: mf.Character, reference: mf.Character) -> list[str]:
@@ -60,9 +61,12 @@ def row(clip: Motion, character: mf.Character, reference: mf.Character) -> list[
     figures = [*shares, 100 * after.max(), derivative_ratio(fit.motion, base, 3), deviation]
     moving = [fit.motion.root, fit.motion.rotations, *(f for f in figures if f is not None)]
     status = fit.status if all(np.isfinite(np.asarray(m, float)).all() for m in moving) else "NaN"
+    corrected = (fit.details.get("balance") or {}).get("zmp_distance_before_m")
+    original, balanced = (_distance(m) for m in balance)
     return [status, f"{shares[0]:.0f}", f"{shares[1]:.0f}", f"{100 * after.max():.1f}",
             "-" if figures[3] is None else f"{figures[3]:.3f}", *("-" if s is None else f"{100 * s:.1f}" for s in slides),
-            *(_distance(m) for m in balance), f"{deviation:.2f}", f"{seconds:.1f}"]  # fmt: skip
+            original, "-" if corrected is None else f"{100 * corrected:.2f}", balanced, f"{deviation:.2f}",
+            f"{seconds:.1f}"]  # fmt: skip
 
 
 def _distance(measures: dict) -> str:
@@ -88,9 +92,9 @@ def write(path: pathlib.Path, rows: list[list[str]]) -> None:
 
 def draw(axes, rows: list[list[str]]) -> None:
     """The distance of each row as a line from the original's to that after: red where it is over a millimetre more."""
-    done = [r for r in rows if "-" not in r[9:11]]
+    done = [r for r in rows if "-" not in (r[9], r[11])]
     for k, r in enumerate(done):
-        start, end = (float(cell.split()[0]) for cell in r[9:11])
+        start, end = (float(r[i].split()[0]) for i in (9, 11))
         colour = "k" if r[1] == "thesis" else "tab:blue" if end <= start + 0.1 else "tab:red"
         axes.plot([start, end], [k, k], color=colour, lw=1.2)
         axes.plot(start, k, "o", color=colour, ms=5, mfc="w")
@@ -122,8 +126,7 @@ def main() -> None:
             print(" | ".join(rows[-1]), flush=True)
             write(path, rows)
     for kind, name in THESIS.items():
-        original, _, balanced = printed.BALANCED[name]
-        rows.append([kind, "thesis", *["-"] * 7, original, balanced, "-", "-"])
+        rows.append([kind, "thesis", *["-"] * 7, *printed.BALANCED[name], "-", "-"])
     table("The whole adaptation", COLUMNS, rows, options.out, "pipeline")
     save_figure(options.out / "pipeline.png", "Balance of the whole adaptation", lambda axes: draw(axes, rows))
 
