@@ -1,5 +1,7 @@
 """General collisions and forearms: groups as data, touches kept, and the trap of the thesis's figure 4.9."""
 
+from types import SimpleNamespace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,13 +19,23 @@ from motionfit._control import Correction
 from motionfit._motion import Motion, host_kinematics, joint_angles, rest_motion
 from motionfit._solve import block_adjoint, block_solver, block_work, solve_block
 from motionfit.adapt import Group, Sphere, Turn, multi_start
-from motionfit.adapt._collisions import ROUNDS, Attempt, Outcome, _windows, hands_meet, without_arms
+from motionfit.adapt._collisions import (
+    HELD,
+    ROUNDS,
+    Attempt,
+    Outcome,
+    _seen_too_near,
+    _windows,
+    hands_meet,
+    without_arms,
+)
 from motionfit.adapt._controls import turn_controls
 from motionfit.adapt._easing import between, eased, sinking_skin
 from motionfit.adapt._groups import GROUPS, MOST, PROBES, Meetings, arm_turns, known_depths
 from motionfit.adapt._limits import SkinLooks
 from motionfit.adapt._record import on_top
 from motionfit.adapt._sampling import sampling
+from motionfit.adapt._stages import smooth_floor
 from motionfit.metrics import skin_depths, skin_gaps
 from motionfit.shape.pairs import PAIRS, Pair
 from motionfit.splines import bspline_basis
@@ -391,6 +403,32 @@ def test_rounds_end_where_they_are_of_no_more_use():
     attempt.done, attempt.shown = True, []
     attempt.go_on(ROUNDS, lambda: told.append(1))
     assert told == []
+
+
+def test_a_field_that_sees_a_touch_too_near_does_not_keep_it_away():
+    dt, off = 1 / 60, np.zeros((60, 2))
+    off[25:35, 0] = 0.02  # the field of the first row sees the touch 2 cm nearer than the skin shows it
+    off[25:35, 1] = -0.02  # and that of the second farther: what keeps it out stays as it is
+    more = _seen_too_near(off, dt)
+    floor = smooth_floor(0.004 + more, dt)
+    assert (floor[25:35, 0] > 0.019).all() and (more[:, 1] == 0.0).all()
+    assert (more[off[:, 0] > 0.0, 0] == 0.02).all() and (more[[0, 10, 50, 59], 0] == 0.0).all()
+
+
+def test_a_touch_is_judged_by_the_skin_and_all_else_by_the_fields(average):
+    still = rest_motion(average.skeleton)
+    attempt = object.__new__(Attempt)
+    depths, gap = np.array([[0.03, 0.03], [0.0, 0.03]]), np.array([[0.022, -0.03], [0.0, -0.03]])
+    small = SimpleNamespace(motion=lambda motion: motion)
+    known = SimpleNamespace(probe_depths=lambda motion: depths[..., None], rows=lambda probes: depths)
+    attempt.asked = SimpleNamespace(at=small, known=known, gaps=lambda *_: gap, most=np.full((2, 2), 0.005), small=None,
+                                    touching=np.array([[True, False], [False, True]]))  # fmt: skip
+    attempt.looks = SimpleNamespace(own=np.zeros((1, 1)), depths=lambda _: np.zeros((1, 1)),
+                                    depths_and_touches=lambda _: np.zeros((1, 1)))  # fmt: skip
+    shown = attempt.judged(_as_fit(still, still, average))
+    # where the skin shows a gap of 2.2 cm, and where it shows what the field does
+    np.testing.assert_allclose(shown.over, [[-0.027, 0.025], [-0.005, 0.025]], atol=1e-12)
+    np.testing.assert_allclose(shown.apart, [[0.022 - HELD, 0.0], [0.0, -0.03 - HELD]], atol=1e-12)
 
 
 def test_by_default_hands_that_meet_nothing_cost_no_block(average):

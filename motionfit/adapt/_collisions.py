@@ -361,9 +361,8 @@ class Attempt:
         at = self.asked.at
         rows = np.arange(len(at.rows))
         may = 0.0 if self.asked.by_skin else self.looks.depths(self.asked.small)
-        # a field that sees a touch where there is a gap is not to keep it, nor in the frames around
-        off = maximum_filter1d(np.maximum(self.off, 0.0), 2 * round(EASE / at.dt) + 1, axis=0)
-        terms = {"collisions": self.meetings.term(self.allowed + off, self.gap - self.off, self.weight),
+        allowed = self.allowed + _seen_too_near(self.off, at.dt)
+        terms = {"collisions": self.meetings.term(allowed, self.gap - self.off, self.weight),
                  "effort": During(Effort(EFFORT), (rows < len(at.frames)).astype(float)),
                  "smoothness": During(Smoothness(self.smooth), (rows < len(at.frames) - 2).astype(float)),
                  "skin": self.looks.touch_term(np.arange(len(PAIRS)), ALLOWED_EXCESS, len(at.rows), may)}  # fmt: skip
@@ -375,6 +374,12 @@ class Attempt:
                   for c, p in zip(self.controls, solved.correction.points, strict=True))  # fmt: skip
         self.points = dataclasses.replace(solved.correction, points=tuple(inside))
         return on_top(self.start, Correction(self.controls, self.points.points), at), solved.history
+
+
+def _seen_too_near(off: Float[np.ndarray, "frames rows"], dt: float) -> Float[np.ndarray, "frames rows"]:
+    """How much deeper [m] fields may show what touches, that are `off` by so much: one that sees a touch where the skin
+    has a gap would keep it. In the frames around too, since what may stay is smoothed."""
+    return maximum_filter1d(np.maximum(off, 0.0), 2 * round(EASE / dt) + 1, axis=0)
 
 
 def hands_meet(clip: Motion, body: Character) -> bool:
