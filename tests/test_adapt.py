@@ -19,7 +19,7 @@ from motionfit._motion import Motion, host_kinematics, joint_angles, resample, r
 from motionfit.adapt._clearance import build_clearance, probe_depths, support
 from motionfit.adapt._controls import arm_controls, leg_controls
 from motionfit.adapt._stages import own_sets, stages_of
-from motionfit.metrics import derivative_ratio, skin_depths
+from motionfit.metrics import TOLERANCE, derivative_ratio, skin_depths
 from motionfit.shape.growth import grow
 from motionfit.shape.pairs import PAIRS, pairs_of
 from motionfit.splines import bspline_basis
@@ -193,6 +193,18 @@ def test_hands_deep_in_a_belly_find_one_way_out(shared_data):
     assert fit.details["excess_after_m"].max() < 0.01
     jerk = mf.metrics.derivative_ratio(fit.motion, fit.base, 3)
     assert jerk is not None and jerk <= 1.05
+
+
+@pytest.mark.parametrize("first, rounds", [(1.0, 5), (0.009, 3)])
+def test_what_has_much_left_and_gets_better_has_more_rounds(heavy, average, monkeypatch, first, rounds):
+    faults = (first * TOLERANCE * 0.99**k for k in range(20))
+    for name, value in {"_amount": lambda _: next(faults), "ROUNDS": 3, "LONGER": 5}.items():
+        monkeypatch.setattr(f"motionfit.adapt._limbs.{name}", value)
+    told = []
+    fit = mf.adapt.limbs(samples.walk(cycles=1), heavy, reference=average, blocks=("legs",),
+                         progress=lambda _, done, total: told.append((done, total)))  # fmt: skip
+    assert len(fit.history) == rounds
+    assert told == [(min(k, 3), 3) for k in range(1, rounds + 1)]
 
 
 def test_a_block_chooses_its_probes_by_their_own_part_in_what_is_wrong(heavy):

@@ -194,10 +194,28 @@ def test_what_is_let_be_is_told(heavy, average, monkeypatch):
     moved = dataclasses.replace(still, rotations=-np.asarray(still.rotations))  # no pose that was seen
     looks.most_seen(moved)
     assert looked == [6]
+    looked.clear()
+    looks.most_seen(moved, looks.frames == 3)  # as it is where the fields say so
+    assert looked == [3, 6]
     walk = samples.walk(cycles=1)
     assert mf.adapt(walk, heavy, reference=average, blocks=("legs",)).status == "converged"
     monkeypatch.setattr(SkinLooks, "most_seen", lambda *_: 0.011)
     assert mf.adapt(walk, heavy, reference=average, blocks=("legs",)).status == "violations_left"
+
+
+def test_the_reference_is_looked_at_only_where_something_is_deep():
+    looks, asked = bare_looks([0], 4), []
+    depths = np.array([[0.0], [0.006], [0.03], [0.012]])
+    looks._look = lambda motion, at: {t: Look(depths[t], NONE) for t in at.tolist()}
+
+    def own(at):
+        asked.extend(at.tolist())
+        return np.full((len(at), 1), 0.01)
+
+    looks._own = own
+    excess = looks._excess(rest_motion(samples.walk().skeleton), np.arange(4))
+    np.testing.assert_allclose(excess, [0.0, 0.006, 0.02, 0.002])
+    assert asked == [2, 3]
 
 
 def test_no_pose_is_looked_at_twice(heavy, average, clip, monkeypatch):
