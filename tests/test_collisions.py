@@ -1,6 +1,7 @@
 """General collisions and forearms: groups as data, touches kept, and the trap of the thesis's figure 4.9."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -417,7 +418,7 @@ def test_a_field_that_sees_a_touch_too_near_does_not_keep_it_away():
 
 def test_a_touch_is_judged_by_the_skin_and_all_else_by_the_fields(average):
     still = rest_motion(average.skeleton)
-    attempt = object.__new__(Attempt)
+    attempt: Any = object.__new__(Attempt)
     depths, gap = np.array([[0.03, 0.03], [0.0, 0.03]]), np.array([[0.022, -0.03], [0.0, -0.03]])
     small = SimpleNamespace(motion=lambda motion: motion)
     known = SimpleNamespace(probe_depths=lambda motion: depths[..., None], rows=lambda probes: depths)
