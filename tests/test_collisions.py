@@ -415,6 +415,21 @@ def test_a_field_that_sees_a_touch_too_near_does_not_keep_it_away():
     assert (floor[25:35, 0] > 0.019).all() and (more[:, 1] == 0.0).all()
     assert (more[off[:, 0] > 0.0, 0] == 0.02).all() and (more[[0, 10, 50, 59], 0] == 0.0).all()
 
+    class Asked(Exception):
+        pass
+
+    def term(allowed, gap, weight):
+        raise Asked(allowed, gap)
+
+    attempt: Any = object.__new__(Attempt)
+    attempt.asked = SimpleNamespace(at=SimpleNamespace(rows=np.arange(60), dt=dt), by_skin=True)
+    attempt.meetings, attempt.weight, attempt.off = SimpleNamespace(term=term), np.ones((60, 2)), off
+    attempt.allowed, attempt.gap = np.full((60, 2), 0.004), np.full((60, 2), 0.012)
+    with pytest.raises(Asked) as asked:
+        attempt._solved()
+    np.testing.assert_array_equal(asked.value.args[0], 0.004 + more)
+    np.testing.assert_array_equal(asked.value.args[1], 0.012 - off)
+
 
 def test_a_touch_is_judged_by_the_skin_and_all_else_by_the_fields(average):
     still = rest_motion(average.skeleton)
