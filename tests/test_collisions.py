@@ -26,6 +26,7 @@ from motionfit.adapt._collisions import (
     Attempt,
     Outcome,
     _seen_too_near,
+    _weights,
     _windows,
     hands_meet,
     without_arms,
@@ -404,6 +405,15 @@ def test_rounds_end_where_they_are_of_no_more_use():
     attempt.done, attempt.shown = True, []
     attempt.go_on(ROUNDS, lambda: told.append(1))
     assert told == []
+
+
+def test_the_wish_for_a_touch_is_whole_to_its_last_frame_and_fades_around_it():
+    touching = np.zeros((60, 2), bool)
+    touching[20:30, 0] = touching[45, 0] = True  # a touch that lasts, and one of a single frame
+    weight = _weights(touching, 1 / 60)
+    assert (weight[touching] == 1.0).all() and (weight[:, 1] == 0.0).all()
+    assert (np.diff(weight[30:36, 0]) < 0.0).all() and 0.3 < weight[30, 0] < 1.0
+    assert (weight[:3, 0] < 0.01).all()
 
 
 def test_a_field_that_sees_a_touch_too_near_does_not_keep_it_away():

@@ -291,9 +291,7 @@ class Attempt:
         self.controls = turn_controls(motion, at.whole, asked.turns)
         self.points = self.best_points = Correction.zero(tuple(at.control(c) for c in self.controls))
         self.smooth = jerk_scale(motion)
-        # in the frames around a touch the hand is on its way
-        touching = maximum_filter1d(asked.touching.astype(float), 3, axis=0)
-        self.weight = gaussian_filter1d(touching, EASE / at.dt, axis=0)
+        self.weight = _weights(asked.touching, at.dt)
         probes = known.probe_depths(at.motion(motion))
         depths = known.rows(probes)
         self.meetings = Meetings(known, at)
@@ -374,6 +372,12 @@ class Attempt:
                   for c, p in zip(self.controls, solved.correction.points, strict=True))  # fmt: skip
         self.points = dataclasses.replace(solved.correction, points=tuple(inside))
         return on_top(self.start, Correction(self.controls, self.points.points), at), solved.history
+
+
+def _weights(touching: Bool[np.ndarray, "frames rows"], dt: float) -> Float[np.ndarray, "frames rows"]:
+    """Of the wish for a touch: 1 to its last frame, and fading in those around it, where the hand is on its way."""
+    around = maximum_filter1d(touching.astype(float), 3, axis=0)
+    return np.maximum(gaussian_filter1d(around, EASE / dt, axis=0), touching)
 
 
 def _seen_too_near(off: Float[np.ndarray, "frames rows"], dt: float) -> Float[np.ndarray, "frames rows"]:
