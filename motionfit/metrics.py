@@ -141,12 +141,23 @@ def posed_frames(character: Character, motion: Motion) -> Iterator[Float[np.ndar
         yield from posed_vertices(character, motion[some]).astype(float)[: motion.frame_count - start]
 
 
-def skin_gaps(
-    character: Character, motion: Motion, pairs: Sequence[Pair], wanted: Bool[np.ndarray, "frames pairs"] | None = None
-) -> Float[np.ndarray, "frames pairs"]:
-    """How far [m] the skin of each pair's first part is from the second's surface: that of its nearest vertex, negative
-    where one is inside. NaN where it is not `wanted` (None: it is everywhere)."""
-    wanted = np.ones((motion.frame_count, len(pairs)), bool) if wanted is None else wanted
+class SkinGap(NamedTuple):
+    """How far apart [m] two parts of a posed skin are, and where: the first part's vertex that is nearest to the second
+    or deepest in it, and the corners of the triangle that is nearest to that, by their numbers in the skin, with where
+    they are [m]."""
+
+    gap: float
+    vertex: int
+    corners: Int[np.ndarray, "3"]
+    vertex_world: Float[np.ndarray, "3"]
+    place_world: Float[np.ndarray, "3"]
+    corners_world: Float[np.ndarray, "3 3"]
+
+
+def nearest_on_skin(
+    character: Character, motion: Motion, pairs: Sequence[Pair], wanted: Bool[np.ndarray, "frames pairs"]
+) -> list[SkinGap]:
+    """How far the skin of pairs' first parts is from the second's surface, frame after frame, where it is `wanted`."""
     known, poses = character.memo.setdefault("gaps", {}), poses_of(motion)
     if len(known) > SHOWN_KEPT:
         known.clear()
@@ -161,10 +172,22 @@ def skin_gaps(
                 by_surface.setdefault(key[2], []).append(key)
         for part, keys in by_surface.items():
             surface = part_surface(character, part)
-            sets = [vertices[part_surface(character, first).vertices] for _, first, _ in keys]
-            known.update(zip(keys, surface_gaps(sets, vertices[surface.used], surface.triangles), strict=True))
+            sets = [part_surface(character, first).vertices for _, first, _ in keys]
+            gaps = surface_gaps([vertices[of] for of in sets], vertices[surface.used], surface.triangles)
+            for key, of, found in zip(keys, sets, gaps, strict=True):
+                vertex, corners = int(of[found.point]), surface.used[surface.triangles[found.triangle]]
+                known[key] = SkinGap(found.gap, vertex, corners, vertices[vertex], found.place, vertices[corners])
+    return [known[key] for keys in asked for key in keys]
+
+
+def skin_gaps(
+    character: Character, motion: Motion, pairs: Sequence[Pair], wanted: Bool[np.ndarray, "frames pairs"] | None = None
+) -> Float[np.ndarray, "frames pairs"]:
+    """How far [m] the skin of each pair's first part is from the second's surface: that of its nearest vertex, negative
+    where one is inside. NaN where it is not `wanted` (None: it is everywhere)."""
+    wanted = np.ones((motion.frame_count, len(pairs)), bool) if wanted is None else wanted
     result = np.full(wanted.shape, np.nan)
-    result[wanted] = [known[key] for keys in asked for key in keys]
+    result[wanted] = [found.gap for found in nearest_on_skin(character, motion, pairs, wanted)]
     return result
 
 

@@ -20,11 +20,13 @@ from motionfit._control import Correction
 from motionfit._motion import Motion, host_kinematics, joint_angles, rest_motion
 from motionfit._solve import block_adjoint, block_solver, block_work, solve_block
 from motionfit.adapt import Group, Sphere, Turn, multi_start
+from motionfit.adapt._asked import Asked
 from motionfit.adapt._collisions import (
     HELD,
     ROUNDS,
     Attempt,
     Outcome,
+    Shown,
     _seen_too_near,
     _weights,
     _windows,
@@ -433,7 +435,8 @@ def test_a_field_that_sees_a_touch_too_near_does_not_keep_it_away():
 
     attempt: Any = object.__new__(Attempt)
     attempt.asked = SimpleNamespace(at=SimpleNamespace(rows=np.arange(60), dt=dt), by_skin=True)
-    attempt.meetings, attempt.weight, attempt.off = SimpleNamespace(term=term), np.ones((60, 2)), off
+    attempt.meetings, attempt.off = SimpleNamespace(term=term), off
+    attempt._hold = lambda: (None, np.ones((60, 2)))
     attempt.allowed, attempt.gap = np.full((60, 2), 0.004), np.full((60, 2), 0.012)
     with pytest.raises(Asked) as asked:
         attempt._solved()
@@ -520,3 +523,49 @@ def test_forearms_point_where_they_did(heavy, average):
     hands = [heavy.skeleton.joint(f"{s}_hand") for s in ("left", "right")]
     turned = [host_kinematics(m)[1][:, hands] for m in (arms.base, fit.motion)]
     np.testing.assert_allclose(np.abs((turned[0] * turned[1]).sum(-1)), 1.0, atol=1e-9)
+
+
+def test_touches_are_held_on_the_skin_and_left_to_the_fields_where_it_was_not_asked(heavy, average):
+    """A hand at a shoulder, where a field of one pose is off: the row that holds it says what the skin says."""
+    clip = mf.onto(samples.walk(cycles=1), heavy.skeleton)[:60]
+    groups = GROUPS[:4]
+    known, at = known_depths(heavy, groups), sampling(clip, groups[0].spacing / 60.0)
+    depths, small = known.depths(at.motion(clip)), at.motion(clip)
+    row = [p[:2] for p in known.clearance.pairs].index(("left_hand", "left_thigh"))
+    touching = np.zeros(depths.shape, bool)
+    touching[10:20, row] = True
+    so_far = _as_fit(clip, clip, heavy)
+    asked = Asked(heavy, so_far, at, known, groups[0].turns, depths, depths, depths, touching, True)
+    shown = skin_gaps(heavy, small[12:13], (known.clearance.pairs[row],))[0, 0]
+    assert shown < 0.06
+    for by_skin, near in ((True, True), (False, False)):
+        attempt = Attempt(asked._replace(by_skin=by_skin), so_far, SkinLooks(small, heavy, average, PAIRS))
+        hold, weight = attempt._hold()
+        assert (attempt.weight[touching] == 1.0).all()
+        held = np.asarray(hold.weight)[: len(at.frames)].sum(axis=1)
+        np.testing.assert_allclose(held + weight[:, row], attempt.weight[:, row], atol=1e-6)
+        assert (held[touching[:, row]] == (1.0 if near else 0.0)).all()
+        if near:
+            padded = small[np.minimum(np.arange(len(at.rows)), small.frame_count - 1)]
+            told = np.asarray(hold.distance(mf.forward_kinematics(heavy.skeleton, padded)))[12]
+            assert np.abs(told - shown).min() < 1e-4
+
+
+def test_what_cannot_be_had_is_not_asked_for_ever_more():
+    attempt: Any = object.__new__(Attempt)
+    rows = np.zeros((4, 1))
+    shown = Shown(rows[..., None], rows, rows, rows + 0.05, rows + 0.05, np.zeros((1, 1)))
+    attempt.asked = SimpleNamespace(touching=np.ones((4, 1), bool), allowed=rows + 0.004, own=rows, so_far=None)
+    attempt.result, attempt.faults, attempt.shown, attempt.history = None, np.inf, [], ()
+    attempt.rounds, attempt.smooth = ROUNDS, 1.0
+    attempt._solved, attempt.judged = lambda: (None, ()), lambda result: shown
+    attempt.meetings = SimpleNamespace(seen=lambda *_: None)
+    attempt.allowed, attempt.gap, attempt.points = rows + 0.004, rows + 0.012, None
+    seen = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("motionfit.adapt._collisions.rougher", lambda *_: 0.0)
+        for _ in range(6):
+            attempt._round()
+            seen.append((float(attempt.allowed[0, 0]), float(attempt.gap[0, 0])))
+    np.testing.assert_allclose(seen[0], (-0.016, -0.008), atol=1e-12)
+    np.testing.assert_allclose(seen[-1], (-0.026, -0.018), atol=1e-12)

@@ -107,7 +107,7 @@ def test_a_field_tells_the_depth_below_the_skin(heavy):
 def test_a_point_over_the_middle_of_a_triangle_may_be_nearer_than_one_at_a_corner():
     box = trimesh.creation.box((1.0, 1.0, 1.0))
     points = np.array([[0.5, 0.5, 0.6], [0.2, 0.1, 0.55]])
-    assert abs(surface_gaps([points], np.asarray(box.vertices), np.asarray(box.faces, np.int64))[0] - 0.05) < 1e-9
+    assert abs(surface_gaps([points], np.asarray(box.vertices), np.asarray(box.faces, np.int64))[0].gap - 0.05) < 1e-9
 
 
 @given(st.integers(0, 2**31), st.sampled_from(["torso", "left_upper_arm", "right_forearm", "left_thigh", "right_calf"]))
@@ -128,7 +128,7 @@ def test_inside_depths_are_those_of_all_triangles(heavy, seed, part):
     assert np.abs(inside_depths(points, vertices, surface.triangles) - wanted).max() < 1e-6
     for some, gap in ((~inside, distance[~inside].min(initial=np.inf)), (inside, -distance[inside].max(initial=0.0))):
         if some.any():
-            assert abs(surface_gaps([points[some]], vertices, surface.triangles)[0] - gap) < 1e-6
+            assert abs(surface_gaps([points[some]], vertices, surface.triangles)[0].gap - gap) < 1e-6
 
 
 def test_gaps_of_a_motion_are_those_of_each_pose_and_pair(heavy):
@@ -145,7 +145,7 @@ def test_gaps_of_a_motion_are_those_of_each_pose_and_pair(heavy):
             surface = part_surface(heavy, pair.second)
             points = posed[part_surface(heavy, pair.first).vertices]
             alone = surface_gaps([points], posed[surface.used], surface.triangles)
-            assert everywhere[t, k] == pytest.approx(alone[0], abs=1e-6)
+            assert everywhere[t, k] == pytest.approx(alone[0].gap, abs=1e-6)
 
 
 def test_a_field_moves_with_its_part(heavy, rng):

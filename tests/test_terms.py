@@ -8,13 +8,14 @@ import pytest
 
 import motionfit as mf
 from motionfit import samples
-from motionfit._motion import rest_motion
+from motionfit._motion import host_kinematics, rest_motion
 from motionfit.adapt import build_clearance
 from motionfit.adapt._clearance import row_depths
 from motionfit.adapt._groups import GROUPS, Meetings, known_depths
 from motionfit.adapt._sampling import sampling
-from motionfit.adapt._touches import KEPT
-from motionfit.shape.pairs import pairs_of
+from motionfit.adapt._touches import KEPT, hold_term, touches_held
+from motionfit.metrics import nearest_on_skin
+from motionfit.shape.pairs import Pair, pairs_of
 from motionfit.splines import bspline_basis
 from motionfit.terms.penetration import hinge
 from tests.helpers import central_difference
@@ -65,6 +66,21 @@ def _terms(character, motion):
     yield "custom", mf.Custom(_level, 0.9)
     for kind in ("contact", "deep"):
         yield f"meetings-{kind}", _meetings(character, motion, kind)
+    hold = _hold(character, motion)
+    yield "hold-contact", eqx.tree_at(lambda t: t.gap, hold, np.asarray(hold.distance(kin)) - 1e-4)
+    yield "hold-lost", eqx.tree_at(lambda t: t.gap, hold, np.asarray(hold.distance(kin)) - 0.05)
+
+
+def _hold(character, motion):
+    """Both hands at thighs and head, each frame by the nearest of two looks."""
+    pairs = tuple(Pair(f"{side}_hand", part, "") for side in ("left", "right") for part in (f"{side}_thigh", "head"))
+    wanted = np.zeros((motion.frame_count, len(pairs)), bool)
+    wanted[1] = wanted[4] = True
+    frames, rows = np.nonzero(wanted)
+    touches = touches_held(character, host_kinematics(motion)[1][frames], rows,
+                           nearest_on_skin(character, motion, pairs, wanted))  # fmt: skip
+    weight = np.full(wanted.shape, 0.5)
+    return hold_term(character, touches, frames, 2, np.zeros(wanted.shape), weight, motion.frame_count)[0]
 
 
 def _meetings(character, motion, kind):
@@ -96,6 +112,8 @@ NAMES += [
     "custom",
     "meetings-contact",
     "meetings-deep",
+    "hold-contact",
+    "hold-lost",
 ]
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -10,10 +11,20 @@ import motionfit as mf
 from motionfit import samples
 from motionfit._motion import host_kinematics, rest_motion
 from motionfit.adapt._limits import Look, SkinLooks
-from motionfit.adapt._touches import KEPT, NEVER, NONE, touch_term, touches_of, touching_on
-from motionfit.metrics import insides, posed_vertices, poses_of, skin_depths
+from motionfit.adapt._touches import (
+    HELD,
+    KEPT,
+    NEVER,
+    NONE,
+    hold_term,
+    touch_term,
+    touches_held,
+    touches_of,
+    touching_on,
+)
+from motionfit.metrics import insides, nearest_on_skin, posed_vertices, poses_of, skin_depths, skin_gaps
 from motionfit.shape import grow
-from motionfit.shape.pairs import pairs_of
+from motionfit.shape.pairs import Pair, pairs_of
 from motionfit.shape.surface import inside_depths, part_surface
 
 PAIRS = pairs_of("arms")
@@ -91,6 +102,74 @@ def test_touches_on_another_body_are_those_of_the_same_vertices(heavy, clip):
     np.testing.assert_allclose(told[real], ways_on(body, moved, term)[real], atol=1e-6)
     itself, blend = (np.swapaxes(np.asarray(t.blend), 1, 2) for t in (touching_on(term, heavy), term))
     np.testing.assert_allclose(itself[real], blend[real], atol=1e-12)
+
+
+HANDS = tuple(Pair(f"{s}_hand", part, "") for s in ("left", "right") for part in ("torso", f"{s}_thigh", "head"))
+HANDS += (Pair("left_upper_arm", "torso", ""),)  # which is inside
+
+
+def held_in(character, clip, wanted, weight, reach=2, length=12):
+    frames, rows = np.nonzero(wanted)
+    gaps = nearest_on_skin(character, clip, HANDS, wanted)
+    touches = touches_held(character, host_kinematics(clip)[1][frames], rows, gaps)
+    return gaps, hold_term(character, touches, frames, reach, np.zeros(wanted.shape), weight, length)
+
+
+def test_what_is_held_is_as_far_as_the_skin_says(heavy, clip):
+    """In the poses that were looked at, outside and inside."""
+    everywhere = np.ones((clip.frame_count, len(HANDS)), bool)
+    gaps, (term, held) = held_in(heavy, clip, everywhere, np.ones(everywhere.shape))
+    padded = clip[np.minimum(np.arange(12), clip.frame_count - 1)]
+    told = np.asarray(term.distance(mf.forward_kinematics(heavy.skeleton, padded)))
+    shown = skin_gaps(heavy, clip, HANDS)
+    assert shown.min() < -0.01 and shown.max() > 0.3 and held.all()
+    np.testing.assert_allclose(told[: clip.frame_count, : len(HANDS)], shown, atol=1e-5)
+    assert not np.asarray(term.weight)[clip.frame_count :].any()
+    posed = posed_vertices(heavy, clip).astype(float)
+    for gap, frame in zip(gaps, np.nonzero(everywhere)[0], strict=True):
+        np.testing.assert_allclose(gap.vertex_world, posed[frame, gap.vertex], atol=1e-9)
+        np.testing.assert_allclose(gap.corners_world, posed[frame, gap.corners], atol=1e-9)
+        assert np.linalg.norm(gap.vertex_world - gap.place_world) == pytest.approx(abs(gap.gap), abs=1e-6)
+
+
+def test_what_is_held_slides_along_a_skin_that_curves_away(heavy, clip):
+    """Beside its place a vertex is as far from the other skin as from a sphere of the term's radius that touches it."""
+    wanted = np.zeros((clip.frame_count, len(HANDS)), bool)
+    wanted[:, 1] = True  # the left hand beside its thigh
+    gaps, (term, _) = held_in(heavy, clip, wanted, wanted.astype(float), 0, clip.frame_count)
+    term = eqx.tree_at(lambda t: t.radius, term, 1.0)
+    shoulder = heavy.skeleton.joint("left_upper_arm")
+    rotations = np.array(clip.rotations, float)
+    turned = Rotation.from_quat(rotations[:, shoulder], scalar_first=True) * Rotation.from_rotvec([0.03, 0.02, 0.04])
+    rotations[:, shoulder] = turned.as_quat(scalar_first=True)
+    moved = dataclasses.replace(clip, rotations=rotations)
+    told = np.asarray(term.distance(mf.forward_kinematics(heavy.skeleton, moved)))[:, 0]
+    posed, aside = posed_vertices(heavy, moved).astype(float), []
+    for t, gap in enumerate(gaps):
+        vertex, normal = posed[t, gap.vertex], (gap.vertex_world - gap.place_world) / gap.gap
+        # the thigh stays where it was: so does the place
+        way = vertex - gap.place_world
+        aside.append(float(np.linalg.norm(way - (way @ normal) * normal)))
+        on_sphere = np.linalg.norm(way + normal) - 1.0
+        # to second order: the sphere curves by a^2 / 2 at its surface, and by h of it less at a height h
+        assert abs(told[t] - on_sphere) < 0.25 * aside[-1] ** 2 / 2.0 + 2e-6
+    assert max(aside) > 0.02  # [m]
+
+
+def test_a_frame_holds_what_was_looked_at_near_it_and_no_more_than_it_has_room_for(heavy, clip):
+    wanted = np.zeros((clip.frame_count, len(HANDS)), bool)
+    wanted[1, 0] = wanted[1, 1] = wanted[8, 1] = True
+    weight = np.zeros(wanted.shape)
+    weight[:, 0], weight[:, 1], weight[:, 5] = 1.0, 0.5, 1.0  # the last has no look
+    _, (term, held) = held_in(heavy, clip, wanted, weight)
+    assert held[:, 0].tolist() == [True] * 4 + [False] * 6
+    assert held[:, 1].tolist() == [True] * 4 + [False] * 2 + [True] * 4 and not held[:, 2:].any()
+    assert np.asarray(term.weight).shape == (12, min(HELD, len(HANDS)))
+    np.testing.assert_array_equal(
+        np.asarray(term.weight)[:10].sum(axis=1), weight[:, 0] * held[:, 0] + 0.5 * held[:, 1]
+    )
+    none, nothing = held_in(heavy, clip, np.zeros_like(wanted), weight)
+    assert none == [] and not nothing[1].any() and not np.asarray(nothing[0].weight).any()
 
 
 def test_touches_give_way_where_the_skin_is_out_too_far():

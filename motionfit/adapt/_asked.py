@@ -10,13 +10,14 @@ from jaxtyping import Bool, Float, Int
 from motionfit._character import Character
 from motionfit._control import Correction
 from motionfit._fit import Fit
-from motionfit._motion import Motion
+from motionfit._motion import Motion, host_kinematics
 from motionfit._onto import onto
 from motionfit.adapt._controls import Turn
 from motionfit.adapt._groups import Known
 from motionfit.adapt._limits import SkinLooks
 from motionfit.adapt._sampling import Sampling, sampling
-from motionfit.metrics import TOLERANCE, skin_depths, skin_gaps
+from motionfit.adapt._touches import Touches, touches_held
+from motionfit.metrics import TOLERANCE, nearest_on_skin, skin_depths, skin_gaps
 from motionfit.shape.pairs import PAIRS, Pair
 
 NEAR, EVERY = 0.06, 3  # [m] by the fields: where the skin is asked, in each third frame that is seen
@@ -47,6 +48,15 @@ class Asked(NamedTuple):
             return -depths
         which = self.touching & self.known.on_skin
         return skin_gaps_near(self.character, of, self.known.clearance.pairs, -depths, which)
+
+    def touches(
+        self, of: Motion, depths: Float[np.ndarray, "frames rows"]
+    ) -> tuple[Touches, Int[np.ndarray, " touches"]]:
+        """Where the skins of what should touch are nearest to each other, and in which frames: those that are asked."""
+        wanted = _asked_on_skin(-depths, self.touching & self.known.on_skin & self.by_skin)
+        frames, rows = np.nonzero(wanted)
+        gaps = nearest_on_skin(self.character, of, self.known.clearance.pairs, wanted)
+        return touches_held(self.character, host_kinematics(of)[1][frames], rows, gaps), frames
 
     def part(self, seen: slice, spacing: float, least: int) -> "Asked":
         """What is asked in some of the frames that are seen, up to the next one after them."""
@@ -102,10 +112,18 @@ def skin_gaps_near(
 ) -> Float[np.ndarray, "frames rows"]:  # fmt: skip
     """How far [m] the first parts are from the second: what the fields say, corrected by what the skin shows, of the
     rows `which`, in some of the frames in which they are near."""
-    wanted = which & (by_field < NEAR)
-    wanted[np.arange(len(wanted)) % EVERY != 0] = False
+    wanted = _asked_on_skin(by_field, which)
     shown, frames, result = skin_gaps(character, motion, pairs, wanted), np.arange(len(wanted)), by_field.copy()
     for k in np.flatnonzero(wanted.any(axis=0)):
         asked = np.flatnonzero(wanted[:, k])
         result[:, k] += np.interp(frames, asked, (shown - by_field)[asked, k])
     return result
+
+
+def _asked_on_skin(
+    by_field: Float[np.ndarray, "frames rows"], which: Bool[np.ndarray, "*frames rows"]
+) -> Bool[np.ndarray, "frames rows"]:
+    """Where the skin is asked: each third frame, where the fields say that parts are near."""
+    wanted = which & (by_field < NEAR)
+    wanted[np.arange(len(wanted)) % EVERY != 0] = False
+    return wanted

@@ -29,8 +29,10 @@ from motionfit.adapt._limits import NEARLY, SkinLooks
 from motionfit.adapt._record import on_top, put_down
 from motionfit.adapt._sampling import sampling
 from motionfit.adapt._stages import jerk_scale
+from motionfit.adapt._touches import hold_term
 from motionfit.metrics import TOLERANCE, skin_gaps
 from motionfit.shape.pairs import PAIRS, Pair
+from motionfit.terms.penetration import TouchHold
 from motionfit.terms.pose import Effort, Smoothness
 
 ALLOWED_EXCESS = 0.004  # [m] that may stay where more was
@@ -40,11 +42,13 @@ TOUCHED = 0.01  # [m] on the reference's skin, which knows better
 TOUCH_AIM = 0.012  # [m] a touch is brought back to
 HELD = 0.016  # [m] a solve is content with: where an arm then sinks in, a touch gives way a little
 EASE = 0.08  # [s] within which a touch is taken up and let go
+BESIDE_TOUCH = 0.24  # [s] around a look at a touch, in which it stands for it
 EFFORT = 1.0  # [rad]
 ROUNDS, PATIENCE = 12, 3  # rounds at most, and without a better result
 BETTER = 0.9  # of the best result so far, at most
 TRIAL, WELL = 2, 0.05  # rounds after which two starts are compared, and the faults below which there is no need to
 CLOSER = (0, 1, 2)  # rounds after which more frames are looked at
+MOST_MORE = 0.03  # [m] that a solve is asked for more, after all rounds
 STIFFER = 4.0  # weight of what the skin shows, against the touches that pull the other way
 BESIDE, TAKEN_UP = 0.6, 0.3  # [s] around what is wrong: what is solved, and of it what a correction is taken up in
 WIDENED = 2  # times that such a run gets longer by BESIDE at both ends
@@ -63,10 +67,10 @@ def collisions(
     """Take the groups' probes out of what they shall avoid, as far as they are deeper in than on `reference`.
 
     Where a hand touched on the reference (within 1 cm, on the skin), it is brought back to within 2 cm of the surface,
-    as far as nothing sinks in for it. Without a reference, what the character shows with the clip before any correction
-    may stay and touches, by the fields. What the arm and leg blocks reached is not undone: their pairs are in the
-    tables, and what their skins show more than on the reference (without one: than so far) becomes rows of the solve,
-    as in `motionfit.adapt.limbs`.
+    as far as nothing sinks in for it: where the skins are nearest to each other, round by round. Without a reference,
+    what the character shows with the clip before any correction may stay and touches, by the fields. What the arm and
+    leg blocks reached is not undone: their pairs are in the tables, and what their skins show more than on the reference
+    (without one: than so far) becomes rows of the solve, as in `motionfit.adapt.limbs`.
     Where touches were lost, and two rounds do not bring them back, arms without any correction are another start: from
     where the arm block led them, to either side of a heavy trunk, hands may not find together again.
 
@@ -340,8 +344,11 @@ class Attempt:
         self.done |= self.faults == 0.0 and self.rounds >= CLOSER[-1]
         if rough > 0.0:
             self.smooth *= 0.5
-        self.allowed = self.allowed - np.where(over > 0.7 * TOLERANCE, np.minimum(over, 0.02), 0.0)
-        self.gap = self.gap - np.where(apart > 0.0, np.minimum(apart + 0.003, 0.02), 0.0)
+        allowed = self.allowed - np.where(over > 0.7 * TOLERANCE, np.minimum(over, 0.02), 0.0)
+        gap = self.gap - np.where(apart > 0.0, np.minimum(apart + 0.003, 0.02), 0.0)
+        # what cannot be had, such as two that pull against each other, is not asked for ever more
+        self.allowed = np.maximum(allowed, self.asked.allowed - MOST_MORE)
+        self.gap = np.maximum(gap, TOUCH_AIM - MOST_MORE)
         self.meetings.seen(shown.probes, np.maximum(self.asked.own, 0.0), shown.depths - self.asked.allowed)
         self.rounds += 1
 
@@ -355,12 +362,24 @@ class Attempt:
         over = np.where(asked.touching, np.minimum(-gap, depths), depths) - asked.most  # a touch is judged by the skin
         return Shown(probes, depths, gap, over, np.where(asked.touching, gap - HELD, 0.0), on_skin)
 
+    def _hold(self) -> tuple[TouchHold, Float[np.ndarray, "frames rows"]]:
+        """What holds the touches where the skins are nearest to each other by now, and the weights of those that are left
+        to the fields, which are off by centimetres at a shoulder: where the skin was not asked."""
+        asked, at = self.asked, self.asked.at
+        now = at.motion(on_top(self.start, Correction(self.controls, self.points.points), at).motion)
+        touches, frames = asked.touches(now, asked.known.depths(now))
+        hold, held = hold_term(asked.character, touches, frames, round(BESIDE_TOUCH / at.dt), self.gap, self.weight,
+                               len(at.rows))  # fmt: skip
+        return hold, np.where(held, 0.0, self.weight)
+
     def _solved(self) -> tuple[Fit, tuple]:
         at = self.asked.at
         rows = np.arange(len(at.rows))
+        hold, weight = self._hold()
         may = 0.0 if self.asked.by_skin else self.looks.depths(self.asked.small)
         allowed = self.allowed + _seen_too_near(self.off, at.dt)
-        terms = {"collisions": self.meetings.term(allowed, self.gap - self.off, self.weight),
+        terms = {"collisions": self.meetings.term(allowed, self.gap - self.off, weight),
+                 "touches": hold,
                  "effort": During(Effort(EFFORT), (rows < len(at.frames)).astype(float)),
                  "smoothness": During(Smoothness(self.smooth), (rows < len(at.frames) - 2).astype(float)),
                  "skin": self.looks.touch_term(np.arange(len(PAIRS)), ALLOWED_EXCESS, len(at.rows), may)}  # fmt: skip

@@ -4,25 +4,26 @@ Near a shoulder the fold of the skin is not where a field of one pose says. The 
 in the pose that was looked at: so what is found there is kept from round to round, and stands for the frames around.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from motionfit._character import Character
 from motionfit._motion import bind_pose
-from motionfit.metrics import Direction
+from motionfit.metrics import Direction, SkinGap
 from motionfit.shape.surface import Inside, part_surface
-from motionfit.terms.penetration import TouchClearance
+from motionfit.terms.penetration import TouchClearance, TouchHold
 
 AT_ONCE = 6  # touches of two parts in one look, each way, at most
 APART = 0.015  # [m] between two of them
 KEPT = 24  # of a block in one look, the latest ones first
 NEVER = 1e3  # [m] allowed where there is no touch
+HELD = 8  # touches of a frame that are held, at most: a hand is on few parts at once
 
 
 class Touches(NamedTuple):
@@ -51,23 +52,87 @@ def touches_of(
     found: Mapping[Direction, Inside], least: Float[np.ndarray, " pairs"],
 ) -> Touches:  # fmt: skip
     """The deepest places of one posed frame, some way apart, that are deeper than `least` [m] of their pair."""
-    from trimesh.triangles import points_to_barycentric
-
-    skin, touches = character.skin, NONE
-    bind = bind_pose(character.skeleton)[1]
+    touches = NONE
     for (pair, _, part), inside in found.items():
         chosen = _deepest(vertices[inside.points], inside.depth, max(float(least[pair]), 1e-4))
         if len(chosen) == 0:
             continue
         surface = part_surface(character, part)
         corners = surface.used[surface.triangles[inside.triangles[chosen]]]
-        places, points = inside.places[chosen], inside.points[chosen]
-        carried_by = skin.main_joint[corners[:, 0]]
-        home, away = (Rotation.from_quat(r[carried_by], scalar_first=True) for r in (bind, rotations_world))
-        normals = (home * away.inv()).apply((places - vertices[points]) / inside.depth[chosen, None])
-        shares = np.nan_to_num(points_to_barycentric(vertices[corners], places), nan=1 / 3)  # NaN: a flat triangle
-        touches = touches.then(Touches(np.full(len(chosen), pair), points, corners, shares, normals, carried_by))
+        points, places = inside.points[chosen], inside.places[chosen]
+        normals = (places - vertices[points]) / inside.depth[chosen, None]
+        rotations = np.broadcast_to(rotations_world, (len(chosen), *rotations_world.shape))
+        touches = touches.then(
+            _touches(
+                character, rotations, np.full(len(chosen), pair), points, corners, vertices[corners], places, normals
+            )
+        )
     return touches
+
+
+def touches_held(
+    character: Character, rotations_world: Float[np.ndarray, "touches joints 4"], rows: Int[np.ndarray, " touches"],
+    gaps: Sequence[SkinGap],
+) -> Touches:  # fmt: skip
+    """Places of posed frames where parts touch, or shall: `rows` say what."""
+    if not gaps:
+        return NONE
+    apart, vertices, corners, points, places, corners_world = (np.array(x) for x in zip(*gaps, strict=True))
+    a, b, c = np.swapaxes(corners_world, 0, 1)
+    facing = np.cross(b - a, c - a)
+    facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
+    near = np.abs(apart)[:, None] < 1e-5  # where the way has no direction, the triangle's
+    normals = np.where(near, facing, (points - places) / np.where(near, 1.0, apart[:, None]))
+    return _touches(character, rotations_world, rows, vertices, corners, corners_world, places, normals)
+
+
+def _touches(
+    character: Character, rotations_world: Float[np.ndarray, "touches joints 4"], pairs: Int[np.ndarray, " touches"],
+    vertices: Int[np.ndarray, " touches"], corners: Int[np.ndarray, "touches 3"],
+    corners_world: Float[np.ndarray, "touches 3 3"], places: Float[np.ndarray, "touches 3"],
+    normals: Float[np.ndarray, "touches 3"],
+) -> Touches:  # fmt: skip
+    """Touches by vertex number, of where they are in the world [m]."""
+    from trimesh.triangles import points_to_barycentric
+
+    carried_by = character.skin.main_joint[corners[:, 0]]
+    bind, posed = bind_pose(character.skeleton)[1][carried_by], rotations_world[np.arange(len(pairs)), carried_by]
+    home, away = (Rotation.from_quat(q, scalar_first=True) for q in (bind, posed))
+    shares = np.nan_to_num(points_to_barycentric(corners_world, places), nan=1 / 3)  # NaN: a flat triangle
+    return Touches(pairs, vertices, corners, shares, (home * away.inv()).apply(normals), carried_by)
+
+
+def hold_term(
+    character: Character, touches: Touches, frame_of: Int[np.ndarray, " touches"], reach: int,
+    gap: Float[np.ndarray, "frames rows"], weight: Float[np.ndarray, "frames rows"], length: int,
+) -> tuple[TouchHold, Bool[np.ndarray, "frames rows"]]:  # fmt: skip
+    """The rows of a solve that hold touches, up to a `gap` [m] and as far as the `weight` says, and which of frames and
+    rows those are: each has the touch of the frame nearest to it, up to `reach` frames away."""
+    frames, rows = weight.shape
+    which = np.full((frames, rows), len(frame_of))
+    for row in np.unique(touches.pairs):
+        own = np.flatnonzero(touches.pairs == row)
+        away = np.abs(np.arange(frames)[:, None] - frame_of[own])
+        which[:, row] = np.where(away.min(axis=1) <= reach, own[away.argmin(axis=1)], len(frame_of))
+    held = (which < len(frame_of)) & (weight > 0.0)
+    slots = np.argsort(-np.where(held, weight, 0.0), axis=1, kind="stable")[:, :HELD]
+    chosen, kind = np.take_along_axis(which, slots, axis=1), jax.dtypes.canonicalize_dtype(float)
+
+    def of_touches(values: np.ndarray) -> np.ndarray:
+        short = np.full((length - frames, chosen.shape[1]), len(frame_of))  # past the last one there is none
+        values = np.concatenate([values, np.zeros((1, *values.shape[1:]), values.dtype)])
+        return values[np.concatenate([chosen, short])]
+
+    def of_rows(values: np.ndarray) -> np.ndarray:
+        values = np.take_along_axis(values, slots, axis=1).astype(kind)
+        return np.pad(values, ((0, length - frames), (0, 0)))
+
+    blend = ways(character, touches.vertices, touches.corners, touches.shares).astype(kind)
+    term = TouchHold(laid_out(of_touches(blend)), of_touches(touches.normals.astype(kind)), of_touches(touches.carried_by),
+                     of_rows(gap), of_rows(np.where(held, weight, 0.0)))  # fmt: skip
+    covered = np.zeros_like(held)
+    np.put_along_axis(covered, slots, True, axis=1)
+    return term, held & covered
 
 
 def touch_term(

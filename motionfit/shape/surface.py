@@ -81,36 +81,51 @@ def inside_depths(
     return depth
 
 
+class Gap(NamedTuple):
+    """How far [m] the nearest of some points is from a surface, or the deepest is inside, below zero."""
+
+    gap: float
+    point: int  # which it is
+    triangle: int
+    place: Float[np.ndarray, "3"]  # [m] on the surface, where that is nearest to it
+
+
 def surface_gaps(
     sets: Sequence[Float[np.ndarray, "_ 3"]], vertices: Float[np.ndarray, "vertices 3"],
     triangles: Int[np.ndarray, "t 3"],
-) -> list[float]:  # fmt: skip
-    """How far [m] the nearest of each set of points is from a surface; where some are inside, how deep the deepest is,
-    below zero."""
+) -> list[Gap]:  # fmt: skip
+    """How far each set of points is from a surface, or how deep inside."""
     ends = np.cumsum([len(points) for points in sets])
-    found = find_inside(np.concatenate(sets), vertices, triangles)
-    cuts = np.searchsorted(found.points, ends)
-    depths = [found.depth[low:high] for low, high in zip([0, *cuts[:-1]], cuts, strict=True)]
-    near = KDTree(vertices)
-    return [-float(d.max()) if len(d) else _distance(points, near, vertices, triangles)
-            for d, points in zip(depths, sets, strict=True)]  # fmt: skip
+    found, near = find_inside(np.concatenate(sets), vertices, triangles), KDTree(vertices)
+    cuts, gaps = np.searchsorted(found.points, ends), []
+    for points, end, low, high in zip(sets, ends, [0, *cuts[:-1]], cuts, strict=True):
+        if low == high:
+            gaps.append(_nearest_outside(points, near, vertices, triangles))
+            continue
+        k = low + int(found.depth[low:high].argmax())
+        point = int(found.points[k]) - int(end) + len(points)
+        gaps.append(Gap(-float(found.depth[k]), point, int(found.triangles[k]), found.places[k]))
+    return gaps
 
 
-def _distance(
+def _nearest_outside(
     points: Float[np.ndarray, "points 3"], near: KDTree, vertices: Float[np.ndarray, "vertices 3"],
     triangles: Int[np.ndarray, "t 3"],
-) -> float:  # fmt: skip
-    """Distance [m] of the nearest of some points, all outside, from a surface."""
+) -> Gap:  # fmt: skip
+    """The nearest of some points, all outside a surface."""
     import igl
 
     # the nearest vertex says which points and triangles can be nearer yet
     apart = np.asarray(near.query(points)[0])
     bound = float(apart.min())
     low, high = _spans(vertices, triangles)
-    some = apart <= bound + float(np.linalg.norm(high - low, axis=1).max())
+    some = np.flatnonzero(apart <= bound + float(np.linalg.norm(high - low, axis=1).max()))
     box = points[some].min(axis=0) - bound, points[some].max(axis=0) + bound
-    squared = igl.point_mesh_squared_distance(points[some], vertices, triangles[_overlap(low, high, *box)])[0]
-    return float(np.sqrt(max(float(np.min(squared)), 0.0)))
+    beside = np.flatnonzero(_overlap(low, high, *box))
+    nearest = igl.point_mesh_squared_distance(points[some], vertices, triangles[beside])
+    squared, triangle, place = (np.asarray(x) for x in nearest)
+    k = int(squared.argmin())
+    return Gap(float(np.sqrt(max(squared[k], 0.0))), int(some[k]), int(beside[triangle[k]]), place[k].copy())
 
 
 def may_be_inside(

@@ -145,15 +145,54 @@ class TouchClearance(Term):
 
     def depth(self, kin: Kinematics) -> Float[Array, "frames touches"]:
         """Depth [m] of every touch; negative where there is a gap."""
-        turns, shifts = kin.skin_transforms()
-        rows = jnp.moveaxis(jnp.concatenate([turns, shifts[..., None]], axis=-1), 2, 1).reshape(len(turns), 3, -1)
-        ways = jnp.swapaxes(rows @ jnp.asarray(self.blend, rows.dtype), 1, 2)
-        carried = jnp.take_along_axis(turns, jnp.asarray(self.carried_by)[..., None, None], axis=1)
-        normals = rotation.matrix_times(carried, jnp.asarray(self.normals, rows.dtype))
+        ways, normals = _ways(kin, self.blend, self.normals, self.carried_by)
         return jnp.sum(normals * ways, axis=-1)
 
     def residual(self, kin: Kinematics) -> Float[Array, "frames touches"]:
         return hinge(self.depth(kin) - jnp.asarray(self.allowed), self.width) / self.sigma
+
+
+class TouchHold(Term):
+    """Touches that are meant, such as a hand on the hip, and shall not come loose.
+
+    As in `TouchClearance`, a vertex and the place on another part's skin that it is nearest to. There the skin curves
+    away from its plane, as a sphere of the `radius` [m]: without that a vertex could slide off along it. `gap` [m] is
+    how far it may be, as far as the `weight` (0..1) says that there is a touch. Beyond `c` times `sigma` [m] a lost touch
+    pulls no harder: pseudo-Huber.
+    """
+
+    blend: Float[AnyArray, "frames four_joints touches"]
+    normals: Float[AnyArray, "frames touches 3"]
+    carried_by: Int[AnyArray, "frames touches"]
+    gap: Float[AnyArray, "frames touches"]
+    weight: Float[AnyArray, "frames touches"]
+    radius: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.05)
+    sigma: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.01)
+    width: Float[AnyArray, ""] = eqx.field(converter=_array, default=0.002)
+    c: Float[AnyArray, ""] = eqx.field(converter=_array, default=2.0)
+
+    def distance(self, kin: Kinematics) -> Float[Array, "frames touches"]:
+        """How far [m] every vertex is from the other skin; negative where it is inside."""
+        ways, normals = _ways(kin, self.blend, self.normals, self.carried_by)
+        depth = jnp.sum(normals * ways, axis=-1)
+        aside = ways - depth[..., None] * normals
+        return jnp.sum(aside * aside, axis=-1) / (2.0 * self.radius) - depth
+
+    def residual(self, kin: Kinematics) -> Float[Array, "frames touches"]:
+        apart = hinge(self.distance(kin) - jnp.asarray(self.gap), self.width) / self.sigma
+        return pseudo_huber(jnp.asarray(self.weight) * apart, jnp.asarray(self.c))
+
+
+def _ways(
+    kin: Kinematics, blend: Float[AnyArray, "frames four_joints touches"], normals: Float[AnyArray, "frames touches 3"],
+    carried_by: Int[AnyArray, "frames touches"],
+) -> tuple[Float[Array, "frames touches 3"], Float[Array, "frames touches 3"]]:  # fmt: skip
+    """The ways of touches from vertex to place [m], and their normals, in the world."""
+    turns, shifts = kin.skin_transforms()
+    rows = jnp.moveaxis(jnp.concatenate([turns, shifts[..., None]], axis=-1), 2, 1).reshape(len(turns), 3, -1)
+    ways = jnp.swapaxes(rows @ jnp.asarray(blend, rows.dtype), 1, 2)
+    carried = jnp.take_along_axis(turns, jnp.asarray(carried_by)[..., None, None], axis=1)
+    return ways, rotation.matrix_times(carried, jnp.asarray(normals, rows.dtype))
 
 
 class SkinContact(Term):
