@@ -20,7 +20,7 @@ from motionfit.shape.pairs import PAIRS, Pair
 from motionfit.shape.surface import Inside, find_inside, inside_depths, part_surface, surface_gaps
 
 TOLERANCE = 0.01  # [m]: the "1 cm" of every frames_over_1cm
-SHOWN_KEPT = 100_000  # poses of which it is known what they show: some 40 MB
+SHOWN_KEPT = 100_000  # poses of which it is known what they show, some 40 MB, and gaps, twice that
 
 
 # --- penetration -----------------------------------------------------------------------------------------------
@@ -176,7 +176,10 @@ def nearest_on_skin(
             gaps = surface_gaps([vertices[of] for of in sets], vertices[surface.used], surface.triangles)
             for key, of, found in zip(keys, sets, gaps, strict=True):
                 vertex, corners = int(of[found.point]), surface.used[surface.triangles[found.triangle]]
-                known[key] = SkinGap(found.gap, vertex, corners, vertices[vertex], found.place, vertices[corners])
+                # a view of the vertex would keep the whole posed skin
+                known[key] = SkinGap(
+                    found.gap, vertex, corners, vertices[vertex].copy(), found.place, vertices[corners]
+                )
     return [known[key] for keys in asked for key in keys]
 
 

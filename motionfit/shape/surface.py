@@ -104,7 +104,7 @@ def surface_gaps(
             continue
         k = low + int(found.depth[low:high].argmax())
         point = int(found.points[k]) - int(end) + len(points)
-        gaps.append(Gap(-float(found.depth[k]), point, int(found.triangles[k]), found.places[k]))
+        gaps.append(Gap(-float(found.depth[k]), point, int(found.triangles[k]), found.places[k].copy()))
     return gaps
 
 
