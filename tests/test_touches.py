@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import motionfit as mf
 from motionfit import samples
-from motionfit._motion import host_kinematics, rest_motion
+from motionfit._motion import bind_pose, host_kinematics, rest_motion
 from motionfit.adapt._limits import Look, SkinLooks
 from motionfit.adapt._touches import (
     HELD,
@@ -132,6 +132,23 @@ def test_what_is_held_is_as_far_as_the_skin_says(heavy, clip):
         # gaps are remembered: none may keep a whole posed skin alive
         assert all(x.base is None or x.base.nbytes < 1000 for x in gap[2:])
         assert np.linalg.norm(gap.vertex_world - gap.place_world) == pytest.approx(abs(gap.gap), abs=1e-6)
+
+
+def test_a_vertex_on_the_other_skin_is_held_along_the_normal_of_its_triangle(heavy, clip):
+    """There the way to its place has no direction."""
+    wanted = np.zeros((clip.frame_count, len(HANDS)), bool)
+    wanted[3, :2] = True  # not the head: what is nearest to a hand far below is its open rim
+    gaps, rotations = nearest_on_skin(heavy, clip, HANDS, wanted), host_kinematics(clip)[1][[3, 3]]
+    on_it = [gap._replace(gap=0.0, vertex_world=gap.place_world) for gap in gaps]
+    away, there = (touches_held(heavy, rotations, np.arange(2), some) for some in (gaps, on_it))
+    for k, gap in enumerate(gaps):
+        a, b, c = gap.corners_world
+        home, now = (Rotation.from_quat(q, scalar_first=True)
+                     for q in (bind_pose(heavy.skeleton)[1][there.carried_by[k]], rotations[k, there.carried_by[k]]))  # fmt: skip
+        facing = (now * home.inv()).apply(there.normals[k])
+        assert np.linalg.norm(facing) == pytest.approx(1.0, abs=1e-6)
+        assert abs(facing @ (b - a)) < 1e-6 and abs(facing @ (c - a)) < 1e-6
+        assert there.normals[k] @ away.normals[k] > 0.3  # outward, as the way to a vertex outside is
 
 
 def test_what_is_held_slides_along_a_skin_that_curves_away(heavy, clip):
