@@ -22,11 +22,16 @@ from motionfit._solve import block_adjoint, block_solver, block_work, solve_bloc
 from motionfit.adapt import Group, Sphere, Turn, multi_start
 from motionfit.adapt._asked import Asked
 from motionfit.adapt._collisions import (
+    ASUNDER,
+    CALMER,
     HELD,
     ROUNDS,
+    TOO_ROUGH,
+    TRIAL,
     Attempt,
     Outcome,
     Shown,
+    _best,
     _seen_too_near,
     _weights,
     _windows,
@@ -34,7 +39,7 @@ from motionfit.adapt._collisions import (
     without_arms,
 )
 from motionfit.adapt._controls import turn_controls
-from motionfit.adapt._easing import between, eased, sinking_skin
+from motionfit.adapt._easing import ROUGHER, between, eased, sinking_skin
 from motionfit.adapt._groups import GROUPS, MOST, PROBES, Meetings, arm_turns, known_depths
 from motionfit.adapt._limits import SkinLooks
 from motionfit.adapt._record import on_top
@@ -551,21 +556,99 @@ def test_touches_are_held_on_the_skin_and_left_to_the_fields_where_it_was_not_as
             assert np.abs(told - shown).min() < 1e-4
 
 
-def test_what_cannot_be_had_is_not_asked_for_ever_more():
+def _rounds_that_show(shown, rough, rounds, monkeypatch):
+    """An attempt whose rounds all show the same, and are rougher than they may be by so much."""
     attempt: Any = object.__new__(Attempt)
-    rows = np.zeros((4, 1))
-    shown = Shown(rows[..., None], rows, rows, rows + 0.05, rows + 0.05, np.zeros((1, 1)))
+    rows, points = np.zeros((4, 1)), iter(range(rounds))
     attempt.asked = SimpleNamespace(touching=np.ones((4, 1), bool), allowed=rows + 0.004, own=rows, so_far=None)
     attempt.result, attempt.faults, attempt.shown, attempt.history = None, np.inf, [], ()
-    attempt.rounds, attempt.smooth = ROUNDS, 1.0
-    attempt._solved, attempt.judged = lambda: (None, ()), lambda result: shown
-    attempt.meetings = SimpleNamespace(seen=lambda *_: None)
+    attempt.rounds, attempt.smooth, attempt.meetings = ROUNDS, 1.0, SimpleNamespace(seen=lambda *_: None)
     attempt.allowed, attempt.gap, attempt.points = rows + 0.004, rows + 0.012, None
-    seen = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("motionfit.adapt._collisions.rougher", lambda *_: 0.0)
-        for _ in range(6):
-            attempt._round()
-            seen.append((float(attempt.allowed[0, 0]), float(attempt.gap[0, 0])))
+    attempt._solved, attempt.judged = lambda: (next(points), ()), lambda result: shown
+    monkeypatch.setattr("motionfit.adapt._collisions.rougher", lambda *_: rough)
+    for _ in range(rounds):
+        attempt._round()
+        yield attempt
+
+
+def _shows(over=0.0, apart=0.0, on_skin=(0.0,), shares=(1.0,)):
+    rows = np.zeros((4, 1))
+    return Shown(rows[..., None], rows, rows, rows + over, rows + apart, np.array(on_skin)[:, None], np.array(shares))
+
+
+def test_what_cannot_be_had_is_not_asked_for_ever_more(monkeypatch):
+    seen = [(float(a.allowed[0, 0]), float(a.gap[0, 0]))
+            for a in _rounds_that_show(_shows(0.05, 0.05), 0.0, 6, monkeypatch)]  # fmt: skip
     np.testing.assert_allclose(seen[0], (-0.016, -0.008), atol=1e-12)
     np.testing.assert_allclose(seen[-1], (-0.026, -0.018), atol=1e-12)
+
+
+@pytest.mark.parametrize(("rough", "smooth", "result"), [(ROUGHER / 2, 1.0, 2), (2 * ROUGHER, CALMER**3, None)])
+def test_only_what_is_too_rough_to_be_taken_gets_calmer(rough, smooth, result, monkeypatch):
+    *_, attempt = _rounds_that_show(_shows(apart=0.05), rough, 3, monkeypatch)
+    assert attempt.smooth == pytest.approx(smooth)
+    assert attempt.result == result  # of equals the last one
+    assert attempt.prospect == pytest.approx(_shows(apart=0.05).faults + max(rough - ROUGHER, 0.0) / TOO_ROUGH)
+
+
+def test_a_fault_counts_as_the_frames_that_its_look_stands_for():
+    seldom, often = _shows(on_skin=(0.01, -0.01), shares=(0.2, 0.8)), _shows(on_skin=(0.01,) * 2 + (-0.01,) * 2,
+                                                                              shares=(0.1, 0.1, 0.4, 0.4))  # fmt: skip
+    assert seldom.faults == pytest.approx(0.4) and often.faults == pytest.approx(seldom.faults)
+    assert _shows(over=0.02).faults == pytest.approx(2.0) and _shows(over=0.009).faults == 0.0
+    assert 1.0 < _shows(apart=1e-6).faults < 1.001 and _shows(apart=ASUNDER / 2).faults == pytest.approx(1.5)
+    assert _shows(apart=1.0).faults == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(("faults", "results", "taken"), [((0.4, 0.1), (1, 2), 2), ((0.1, 0.4), (1, 2), 1),
+                                                          ((0.1, 0.4), (None, 2), 2), ((0.1, 0.6), (None, 2), None)])  # fmt: skip
+def test_of_two_starts_the_better_one_is_taken_and_the_other_where_it_comes_to_nothing(
+    faults, results, taken, average, monkeypatch
+):
+    """`faults` are those after the first rounds and `results` what they come to, without a correction and with it."""
+    made, went_on = [], []
+
+    class Start:
+        done, rounds, history = False, 0, ()
+
+        def __init__(self, asked, start, looks):
+            self.at = len(made)
+            self.looks, self.result, self.prospect = looks, results[self.at], faults[self.at]
+            self.faults = self.prospect
+            made.append(start)
+
+        def go_on(self, rounds, tell):
+            went_on.append((self.at, rounds))
+
+        def look_between(self):
+            return False
+
+        def judged(self, result):
+            return _shows()
+
+    monkeypatch.setattr("motionfit.adapt._collisions.Attempt", Start)
+    monkeypatch.setattr("motionfit.adapt._collisions.without_arms", lambda fit: "without arms")
+    monkeypatch.setattr("motionfit.adapt._collisions.sinking_skin", lambda *_: None)
+    monkeypatch.setattr("motionfit.adapt._collisions.eased", lambda name, so_far, result, *_: result)
+    fit: Any = SimpleNamespace(motion=rest_motion(average.skeleton))
+    asked = Asked(average, fit, SimpleNamespace(motion=lambda m: m), *(None,) * 6, True)  # pyright: ignore[reportArgumentType]
+    looks: Any = object.__new__(SkinLooks)
+    monkeypatch.setattr(SkinLooks, "anew", lambda self: self)
+    assert _best(asked, 0.5, True, looks, lambda: None).fit == taken
+    assert made == [fit, "without arms"] and went_on[:2] == [(0, TRIAL), (1, TRIAL)]
+    first = int(np.argmin(faults))
+    assert went_on[2:] == [(first, ROUNDS), (1 - first, ROUNDS)][: 1 if results[first] else 2]
+    made.clear()
+    _best(asked, 0.5, False, looks, lambda: None)  # no touch was lost
+    assert made == [fit]
+
+
+def test_the_skin_of_what_touches_is_looked_at_once(average):
+    known = known_depths(average, GROUPS)
+    touching = np.zeros((4, len(known.clearance.pairs)), bool)
+    asked = Asked(*(None,) * 3, known, *(None,) * 4, touching, True)  # pyright: ignore[reportArgumentType]
+    assert asked.looked_at == PAIRS
+    names = [p.name for p in known.clearance.pairs]
+    for name in ("left_hand/right_hand", "right_hand/left_hand", "left_hand/head", "left_hand/torso"):
+        touching[2, names.index(name)] = True
+    assert [p.name for p in asked.looked_at[len(PAIRS) :]] == ["left_hand/head", "left_hand/right_hand"]

@@ -5,6 +5,8 @@ import dataclasses
 import equinox as eqx
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import motionfit as mf
@@ -214,6 +216,15 @@ def bare_looks(at, frames, own=0.0):
     looks.own, looks.deepest, looks.eased = np.full((len(at), 1), own), *(np.zeros((len(at), 1)) for _ in range(2))
     looks.let_be = np.zeros(0, int)
     return looks
+
+
+@given(st.sets(st.integers(0, 40), min_size=1), st.integers(41, 60))
+def test_a_look_stands_for_the_frames_nearest_to_it(at, frames):
+    looks = bare_looks(sorted(at), frames)
+    away = np.abs(np.arange(frames)[:, None] - looks.at)
+    nearest = away == away.min(axis=1, keepdims=True)
+    halves = nearest / nearest.sum(axis=1, keepdims=True)  # a frame as near to two of them is shared
+    np.testing.assert_allclose(looks.shares, halves.sum(axis=0) / frames, atol=1e-12)
 
 
 def test_the_skin_goes_before_the_fields():

@@ -42,6 +42,17 @@ class Asked(NamedTuple):
         """The motion so far, in the frames that are seen."""
         return self.at.motion(self.so_far.motion)
 
+    @property
+    def looked_at(self) -> tuple[Pair, ...]:
+        """The pairs whose skin is looked at: those of arms and legs, and what touches somewhere, since what is held
+        together must not be pulled into each other."""
+        rows = np.flatnonzero(self.touching.any(axis=0) & self.known.on_skin)
+        either_way = {frozenset(pair[:2]): pair for pair in PAIRS}
+        for row in rows:
+            pair = self.known.clearance.pairs[row]
+            either_way.setdefault(frozenset(pair[:2]), pair)
+        return tuple(either_way.values())
+
     def gaps(self, of: Motion, depths: Float[np.ndarray, "frames rows"]) -> Float[np.ndarray, "frames rows"]:
         """How far [m] what should touch is apart."""
         if not self.by_skin:
@@ -78,10 +89,10 @@ class Wrong(NamedTuple):
 
     def looks(self, asked: Asked, seen: slice | np.ndarray) -> SkinLooks:
         """Looks at the skin in some of the frames that are seen."""
-        return SkinLooks(self.clip[asked.at.frames[seen]], asked.character, self.reference, PAIRS)
+        return SkinLooks(self.clip[asked.at.frames[seen]], asked.character, self.reference, asked.looked_at)
 
     def on_skin(self, asked: Asked, small: Motion) -> Int[np.ndarray, " some"]:
-        """The frames that are seen in which arms and legs show more than the tolerance on the skin."""
+        """The frames that are seen in which the skin shows more than the tolerance."""
         looks = self.looks(asked, slice(None))
         looks.look_between(small)
         return looks.at[(looks.depths(small) - looks.own > TOLERANCE).any(axis=1)]

@@ -23,7 +23,7 @@ from motionfit._solve import Block
 from motionfit.adapt._asked import EVERY, NEAR, Asked, Wrong, cut, skin_gaps_near
 from motionfit.adapt._clearance import all_rows, build_clearance
 from motionfit.adapt._controls import turn_controls
-from motionfit.adapt._easing import between, eased, rougher, sinking_skin
+from motionfit.adapt._easing import ROUGHER, between, eased, rougher, sinking_skin
 from motionfit.adapt._groups import GROUPS, Group, Known, Meetings, known_depths
 from motionfit.adapt._limits import NEARLY, SkinLooks
 from motionfit.adapt._record import on_top, put_down
@@ -31,7 +31,7 @@ from motionfit.adapt._sampling import sampling
 from motionfit.adapt._stages import jerk_scale
 from motionfit.adapt._touches import hold_term
 from motionfit.metrics import TOLERANCE, skin_gaps
-from motionfit.shape.pairs import PAIRS, Pair
+from motionfit.shape.pairs import Pair
 from motionfit.terms.penetration import TouchHold
 from motionfit.terms.pose import Effort, Smoothness
 
@@ -46,6 +46,9 @@ BESIDE_TOUCH = 0.24  # [s] around a look at a touch, in which it stands for it
 EFFORT = 1.0  # [rad]
 ROUNDS, PATIENCE = 12, 3  # rounds at most, and without a better result
 BETTER = 0.9  # of the best result so far, at most
+TOO_ROUGH = 0.2  # of the jerk's ratio, which counts as much as a touch lost in all frames
+CALMER = 0.7  # of the jerk that a correction may have, where it was too rough: one too calm holds no touch
+ASUNDER = 0.1  # [m] beyond a touch, from which on one that is lost counts as much as a violation
 TRIAL, WELL = 2, 0.05  # rounds after which two starts are compared, and the faults below which there is no need to
 CLOSER = (0, 1, 2)  # rounds after which more frames are looked at
 MOST_MORE = 0.03  # [m] that a solve is asked for more, after all rounds
@@ -174,7 +177,7 @@ def _run_by_run(
         least = max((w.stop - w.start for w in windows), default=0)
         for w in windows:
             if (w.start, w.stop) not in solved:
-                faults = _faults(wrong.worst[w], wrong.apart[w], np.zeros((1, 1)))
+                faults = _faults(wrong.worst[w], wrong.apart[w])
                 part, lost = asked.part(w, spacing, least), bool((wrong.apart[w] > 0.0).any())
                 solved[w.start, w.stop] = _best(part, faults, lost, wrong.looks(asked, w), told_round)
         result, taken, sinking = put_in(windows)
@@ -222,17 +225,19 @@ def _best(
 ) -> Outcome:  # fmt: skip
     """The best fit that some rounds find. What makes matters worse is let be, as is a touch that cannot be had without
     sinking in elsewhere."""
-    best = Attempt(asked, asked.so_far, looks)
-    best.go_on(TRIAL, tell)
-    if not best.done and best.faults > WELL and lost:
+    starts = [Attempt(asked, asked.so_far, looks)]
+    starts[0].go_on(TRIAL, tell)
+    if not starts[0].done and starts[0].faults > WELL and lost:
         # arms that were led out to either side of a trunk may not find together again from there
-        other = Attempt(asked, without_arms(asked.so_far), looks.anew())
-        other.go_on(TRIAL, tell)
-        best = min(best, other, key=lambda attempt: attempt.on_fields)
-    best.go_on(ROUNDS, tell)
-    if best.look_between():
-        best.go_on(best.rounds + PATIENCE, tell)
-    if best.result is None or best.faults >= faults:
+        starts.append(Attempt(asked, without_arms(asked.so_far), looks.anew()))
+        starts[1].go_on(TRIAL, tell)
+    for best in sorted(starts, key=lambda attempt: attempt.prospect):
+        best.go_on(ROUNDS, tell)
+        if best.look_between():
+            best.go_on(best.rounds + PATIENCE, tell)
+        if best.result is not None and best.faults < faults:
+            break
+    else:
         return Outcome(None, False, best.history)
     result, shown = best.result, best.judged(best.result)
     sunk = sinking_skin(best.looks, asked.small, asked.at)
@@ -274,10 +279,11 @@ class Shown(NamedTuple):
     over: Float[np.ndarray, "frames rows"]
     apart: Float[np.ndarray, "frames rows"]
     on_skin: Float[np.ndarray, "looks pairs"]
+    shares: Float[np.ndarray, " looks"]  # of the frames, that each look stands for
 
     @property
     def faults(self) -> float:
-        return _faults(self.over, self.apart, self.on_skin)
+        return _faults(self.over, self.apart, float(self.shares @ (self.on_skin > 0.0).any(axis=1)))
 
 
 class Attempt:
@@ -287,7 +293,9 @@ class Attempt:
         self.asked, self.start, self.looks = asked, start, looks
         self.result: Fit | None = None  # the best so far
         self.faults, self.shown = np.inf, []  # the least so far, and those of each round that can be compared
-        self.on_fields = np.inf  # those of the last round, but for what the skin shows: that takes more rounds to learn
+        self.prospect = (
+            np.inf
+        )  # the faults of the last round, but for those of the skin, which take more rounds to learn
         self.done, self.rounds = False, 0
         self.history: tuple[BlockReport, ...] = ()
         motion, at, known = start.motion, asked.at, asked.known
@@ -334,16 +342,16 @@ class Attempt:
             self.looks.look_closer(joint_angles(moved, self.asked.small).max(axis=1))
         shown, rough = self.judged(result), rougher(result, self.asked.so_far)
         self.off = np.where(self.asked.touching, shown.gap + shown.depths, 0.0)
-        self.on_fields = _faults(shown.over, shown.apart, np.zeros((1, 1)))
-        if rough <= 0.01:
+        self.prospect = _faults(shown.over, shown.apart) + max(rough - ROUGHER, 0.0) / TOO_ROUGH
+        if rough <= ROUGHER:
             self.shown.append(shown.faults)
-            if shown.faults < self.faults:
+            if shown.faults <= self.faults:  # of equals the one that was asked for more
                 self.faults, self.result, self.best_points = shown.faults, result, self.points
         over, apart = shown.over, shown.apart
         self.done = max(over.max() - 0.7 * TOLERANCE, apart.max(), shown.on_skin.max(), rough) <= 0.0
         self.done |= self.faults == 0.0 and self.rounds >= CLOSER[-1]
-        if rough > 0.0:
-            self.smooth *= 0.5
+        if rough > ROUGHER:
+            self.smooth *= CALMER
         allowed = self.allowed - np.where(over > 0.7 * TOLERANCE, np.minimum(over, 0.02), 0.0)
         gap = self.gap - np.where(apart > 0.0, np.minimum(apart + 0.003, 0.02), 0.0)
         # what cannot be had, such as two that pull against each other, is not asked for ever more
@@ -360,7 +368,7 @@ class Attempt:
         may = np.maximum(self.looks.depths(asked.small) - own + ROOM, NEARLY * TOLERANCE)
         on_skin = self.looks.depths_and_touches(moved) - own - may
         over = np.where(asked.touching, np.minimum(-gap, depths), depths) - asked.most  # a touch is judged by the skin
-        return Shown(probes, depths, gap, over, np.where(asked.touching, gap - HELD, 0.0), on_skin)
+        return Shown(probes, depths, gap, over, np.where(asked.touching, gap - HELD, 0.0), on_skin, self.looks.shares)
 
     def _hold(self) -> tuple[TouchHold, Float[np.ndarray, "frames rows"]]:
         """What holds the touches where the skins are nearest to each other by now, and the weights of those that are left
@@ -382,7 +390,7 @@ class Attempt:
                  "touches": hold,
                  "effort": During(Effort(EFFORT), (rows < len(at.frames)).astype(float)),
                  "smoothness": During(Smoothness(self.smooth), (rows < len(at.frames) - 2).astype(float)),
-                 "skin": self.looks.touch_term(np.arange(len(PAIRS)), ALLOWED_EXCESS, len(at.rows), may)}  # fmt: skip
+                 "skin": self.looks.touch_term(np.arange(len(self.looks.pairs)), ALLOWED_EXCESS, len(at.rows), may)}  # fmt: skip
         problem = Problem(self.asked.character, self.seen, terms, self.points.controls, {"skin": STIFFER})
         block = Block("collisions", tuple(c.name for c in self.controls), max_steps=24, tolerance=1e-3)
         solved = fit(problem, (block,), correction=self.points)
@@ -439,11 +447,13 @@ def _shown(
 
 def _faults(
     over: Float[np.ndarray, "frames rows"], apart: Float[np.ndarray, "frames rows"],
-    on_skin: Float[np.ndarray, "looks pairs"],
+    sunk: float = 0.0,
 ) -> float:  # fmt: skip
-    """Share of the frames that show a violation, and of those that lost a touch: what a solve is judged by."""
-    shown = (over > TOLERANCE).any(axis=1).mean() + (on_skin > 0.0).any(axis=1).mean()
-    return 2.0 * float(shown) + float((apart > 0.0).mean(axis=0).sum())
+    """Share of the frames that show a violation, on the fields or as `sunk` says on the skin, and of those that lost a
+    touch, which counts half as much where it is lost by little: what a solve is judged by."""
+    shown = (over > TOLERANCE).any(axis=1).mean() + sunk
+    lost = np.where(apart > 0.0, 1.0 + np.minimum(apart / ASUNDER, 1.0), 0.0)
+    return 2.0 * float(shown) + float(lost.mean(axis=0).sum())
 
 
 def _told(pairs, excess_before, excess_after, gap_before, gap_after, touching) -> dict:

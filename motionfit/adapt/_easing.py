@@ -17,6 +17,7 @@ from motionfit.metrics import TOLERANCE, derivative_ratio
 
 SLOPE = 0.08  # [s] of the Gaussian that a share rises and falls by
 YIELDS = 0.2  # [s] around what sinks in, in which a correction gives way
+ROUGHER = 0.01  # of the jerk's ratio, that is borne
 GIVES = (0.1, 0.2, 0.3, *(0.5,) * 5)  # of what sinks in, one after the other: a touch bears little of it
 
 
@@ -39,7 +40,7 @@ def eased(name: str, so_far: Fit, result: Fit, at: Sampling, sunk: Callable[[Fit
     share, whole, width = np.ones(so_far.motion.frame_count), result, SLOPE / dt
     for gives in GIVES:
         where = sunk(result)
-        if not where.any() and rougher(result, so_far) <= 0.01:
+        if not where.any() and rougher(result, so_far) <= ROUGHER:
             return result
         around = np.zeros(len(share))
         around[at.frames[where]] = 1.0

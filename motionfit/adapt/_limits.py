@@ -76,6 +76,12 @@ class SkinLooks:
             return np.zeros((len(at), len(self.pairs)))
         return skin_depths(self.reference, self.original[at], self.pairs).depth
 
+    @property
+    def shares(self) -> Float[np.ndarray, " looks"]:
+        """Of the frames, that each look stands for: those nearest to it. More looks lie where more may be wrong."""
+        ends = np.concatenate([[-0.5], (self.at[1:] + self.at[:-1]) / 2, [len(self.frames) - 0.5]])
+        return np.diff(ends) / len(self.frames)
+
     def anew(self) -> "SkinLooks":
         """Looks that start over, but look at no pose twice."""
         fresh = SkinLooks(self.clip, self.character, self.reference, self.pairs)
