@@ -28,6 +28,7 @@ from motionfit.adapt._collisions import (
     ROUNDS,
     TOO_ROUGH,
     TRIAL,
+    WELL,
     Attempt,
     Outcome,
     Shown,
@@ -600,8 +601,11 @@ def test_a_fault_counts_as_the_frames_that_its_look_stands_for():
     assert _shows(apart=1.0).faults == pytest.approx(2.0)
 
 
-@pytest.mark.parametrize(("faults", "results", "taken"), [((0.4, 0.1), (1, 2), 2), ((0.1, 0.4), (1, 2), 1),
-                                                          ((0.1, 0.4), (None, 2), 2), ((0.1, 0.6), (None, 2), None)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("faults", "results", "taken"),
+    [((0.4, 0.1), (1, 2), 2), ((0.1, 0.4), (1, 2), 1), ((0.01, 0.0), (1, 2), 1), ((0.1, 0.4), (None, 2), 2),
+     ((0.1, 0.6), (None, 2), None)],
+)  # fmt: skip
 def test_of_two_starts_the_better_one_is_taken_and_the_other_where_it_comes_to_nothing(
     faults, results, taken, average, monkeypatch
 ):
@@ -614,7 +618,7 @@ def test_of_two_starts_the_better_one_is_taken_and_the_other_where_it_comes_to_n
         def __init__(self, asked, start, looks):
             self.at = len(made)
             self.looks, self.result, self.prospect = looks, results[self.at], faults[self.at]
-            self.faults = self.prospect
+            self.faults = max(self.prospect, 2 * WELL)  # what the skin shows needs no other start
             made.append(start)
 
         def go_on(self, rounds, tell):
@@ -631,13 +635,16 @@ def test_of_two_starts_the_better_one_is_taken_and_the_other_where_it_comes_to_n
     monkeypatch.setattr("motionfit.adapt._collisions.sinking_skin", lambda *_: None)
     monkeypatch.setattr("motionfit.adapt._collisions.eased", lambda name, so_far, result, *_: result)
     fit: Any = SimpleNamespace(motion=rest_motion(average.skeleton))
-    asked = Asked(average, fit, SimpleNamespace(motion=lambda m: m), *(None,) * 6, True)  # pyright: ignore[reportArgumentType]
+    asked = Asked._make([average, fit, SimpleNamespace(motion=lambda m: m), *[None] * 6, True])
     looks: Any = object.__new__(SkinLooks)
     monkeypatch.setattr(SkinLooks, "anew", lambda self: self)
     assert _best(asked, 0.5, True, looks, lambda: None).fit == taken
-    assert made == [fit, "without arms"] and went_on[:2] == [(0, TRIAL), (1, TRIAL)]
-    first = int(np.argmin(faults))
-    assert went_on[2:] == [(first, ROUNDS), (1 - first, ROUNDS)][: 1 if results[first] else 2]
+    if faults[0] < WELL:
+        assert made == [fit] and went_on == [(0, TRIAL), (0, ROUNDS)]
+    else:
+        assert made == [fit, "without arms"] and went_on[:2] == [(0, TRIAL), (1, TRIAL)]
+        first = int(np.argmin(faults))
+        assert went_on[2:] == [(first, ROUNDS), (1 - first, ROUNDS)][: 1 if results[first] else 2]
     made.clear()
     _best(asked, 0.5, False, looks, lambda: None)  # no touch was lost
     assert made == [fit]
@@ -646,7 +653,7 @@ def test_of_two_starts_the_better_one_is_taken_and_the_other_where_it_comes_to_n
 def test_the_skin_of_what_touches_is_looked_at_once(average):
     known = known_depths(average, GROUPS)
     touching = np.zeros((4, len(known.clearance.pairs)), bool)
-    asked = Asked(*(None,) * 3, known, *(None,) * 4, touching, True)  # pyright: ignore[reportArgumentType]
+    asked = Asked._make([*[None] * 3, known, *[None] * 4, touching, True])
     assert asked.looked_at == PAIRS
     names = [p.name for p in known.clearance.pairs]
     for name in ("left_hand/right_hand", "right_hand/left_hand", "left_hand/head", "left_hand/torso"):

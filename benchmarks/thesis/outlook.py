@@ -33,7 +33,7 @@ from motionfit.shape.pairs import Pair
 
 KINDS: dict[str, str] = {
     "hands on hip": "bvh/29_03_teapot_hand_on_hip", "arms crossing": "bvh/02_10_wash_self_arms_crossing",
-    "two hands": "bvh/64_01_golf_swing_two_hands", "walk": "bvh/02_01_walk",
+    "folding arms": "bvh/05_03_dance_folding_arms", "two hands": "bvh/64_01_golf_swing_two_hands", "walk": "bvh/02_01_walk",
 }  # fmt: skip
 OTHER = {"left": "right", "right": "left"}
 TOUCHES = tuple(Pair(f"{s}_hand", part, "") for s, o in OTHER.items() for part in

@@ -227,7 +227,7 @@ def _best(
     sinking in elsewhere."""
     starts = [Attempt(asked, asked.so_far, looks)]
     starts[0].go_on(TRIAL, tell)
-    if not starts[0].done and starts[0].faults > WELL and lost:
+    if not starts[0].done and starts[0].prospect > WELL and lost:
         # arms that were led out to either side of a trunk may not find together again from there
         starts.append(Attempt(asked, without_arms(asked.so_far), looks.anew()))
         starts[1].go_on(TRIAL, tell)
