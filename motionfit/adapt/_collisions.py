@@ -293,9 +293,8 @@ class Attempt:
         self.asked, self.start, self.looks = asked, start, looks
         self.result: Fit | None = None  # the best so far
         self.faults, self.shown = np.inf, []  # the least so far, and those of each round that can be compared
-        self.prospect = (
-            np.inf
-        )  # the faults of the last round, but for those of the skin, which take more rounds to learn
+        # the faults of the last round, but for those of the skin, which take more rounds to learn
+        self.prospect = np.inf
         self.done, self.rounds = False, 0
         self.history: tuple[BlockReport, ...] = ()
         motion, at, known = start.motion, asked.at, asked.known
