@@ -458,7 +458,7 @@ def test_a_touch_is_judged_by_the_skin_and_all_else_by_the_fields(average):
     known = SimpleNamespace(probe_depths=lambda motion: depths[..., None], rows=lambda probes: depths)
     attempt.asked = SimpleNamespace(at=small, known=known, gaps=lambda *_: gap, most=np.full((2, 2), 0.005), small=None,
                                     touching=np.array([[True, False], [False, True]]))  # fmt: skip
-    attempt.looks = SimpleNamespace(own=np.zeros((1, 1)), depths=lambda _: np.zeros((1, 1)),
+    attempt.looks = SimpleNamespace(own=np.zeros((1, 1)), shares=np.ones(1), depths=lambda _: np.zeros((1, 1)),
                                     depths_and_touches=lambda _: np.zeros((1, 1)))  # fmt: skip
     shown = attempt.judged(_as_fit(still, still, average))
     # where the skin shows a gap of 2.2 cm, and where it shows what the field does
@@ -584,7 +584,13 @@ def test_what_cannot_be_had_is_not_asked_for_ever_more(monkeypatch):
     np.testing.assert_allclose(seen[-1], (-0.026, -0.018), atol=1e-12)
 
 
-@pytest.mark.parametrize(("rough", "smooth", "result"), [(ROUGHER / 2, 1.0, 2), (2 * ROUGHER, CALMER**3, None)])
+@pytest.mark.parametrize(
+    ("rough", "smooth", "result"),
+    [
+        (ROUGHER / 2, 1.0, 2),
+        (2 * ROUGHER, CALMER**3, None),
+    ],
+)
 def test_only_what_is_too_rough_to_be_taken_gets_calmer(rough, smooth, result, monkeypatch):
     *_, attempt = _rounds_that_show(_shows(apart=0.05), rough, 3, monkeypatch)
     assert attempt.smooth == pytest.approx(smooth)
