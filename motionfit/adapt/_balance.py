@@ -273,10 +273,11 @@ def _sinking(clip: Motion, character: Character, reference: Character | None, so
     before = volume_depths(clearance, at.motion(so_far)) - limit
     near = bool((before + limit)[:, [PAIRS.index(p) for p in legs]].max() > -NEAR)
     looks = np.arange(0, len(at.frames), max(1, round(LOOKS_APART / at.dt)))
-    looked, own = at.frames[looks], 0.0
+    looked, own, columns = at.frames[looks], 0.0, [PAIRS.index(p) for p in legs]
+    # of all pairs, since the limbs' blocks looked at most of these poses already
     if near and reference is not None:
-        own = skin_depths(reference, onto(clip[looked], reference.skeleton), legs).depth
-    before_on_skin = skin_depths(character, so_far[looked], legs).depth - own if near else None
+        own = skin_depths(reference, onto(clip[looked], reference.skeleton)).depth[:, columns]
+    before_on_skin = skin_depths(character, so_far[looked]).depth[:, columns] - own if near else None
 
     def sinks(motion: Motion) -> Bool[np.ndarray, " seen"]:
         now = volume_depths(clearance, at.motion(motion)) - limit
