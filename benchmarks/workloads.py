@@ -214,7 +214,9 @@ def joints(counts: tuple[int, ...] = (31, 124, 496)) -> Iterator[Metric]:
     for count in counts[1:]:
         pace = interleaved(works[count], works[first])
         yield seconds(f"joints.run_{count}", pace.run_s, "ms")
-        yield time_ratio(f"joints.run_per_joint_{count}_over_{first}", pace.ratio * first / count)
+        # a few joints stay in a core's cache, many do not, which costs by machine and neighbours up to twice as much;
+        # the square of their number would cost sixteen times as much
+        yield time_ratio(f"joints.run_per_joint_{count}_over_{first}", pace.ratio * first / count, 1.0)
         yield time_ratio(f"joints.compile_{count}_over_{first}", compiling[count] / compiling[first], 1.5)
 
 
