@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import motionfit as mf
 from motionfit import samples
 from motionfit._motion import bind_pose, host_kinematics, rest_motion
-from motionfit.adapt._limits import Look, SkinLooks
+from motionfit.adapt._limits import Look, SkinLooks, shown_between
 from motionfit.adapt._touches import (
     HELD,
     KEPT,
@@ -310,6 +310,39 @@ def test_what_is_let_be_is_told(heavy, average, monkeypatch):
     assert mf.adapt(walk, heavy, reference=average, blocks=("legs",)).status == "converged"
     monkeypatch.setattr(SkinLooks, "most_seen", lambda *_: 0.011)
     assert mf.adapt(walk, heavy, reference=average, blocks=("legs",)).status == "violations_left"
+
+
+@pytest.fixture(scope="module")
+def kicking(average):
+    """Standing at 120 frames per second; in one frame a leg is across the other."""
+    rest = rest_motion(average.skeleton)
+    rotations = np.repeat(np.asarray(rest.rotations, float), 24, axis=0)
+    hip, turn = average.skeleton.joint("left_thigh"), Rotation.from_rotvec([0.0, 0.0, -0.5])
+    world = Rotation.from_quat(bind_pose(average.skeleton)[1][hip], scalar_first=True)
+    local = Rotation.from_quat(rotations[13, hip], scalar_first=True) * (world.inv() * turn * world)
+    rotations[13, hip] = local.as_quat(scalar_first=True)
+    return mf.Motion(average.skeleton, np.repeat(np.asarray(rest.root), 24, axis=0), rotations, 1 / 120)
+
+
+def test_what_is_deep_in_a_frame_that_no_block_saw_is_told(average, heavy, kicking):
+    legs = pairs_of("legs")
+    deep = skin_depths(average, kicking, legs).depth.max(axis=1)
+    assert deep.argmax() == 13 and deep[13] > 0.02
+    seen = np.arange(0, 24, 4)
+    assert shown_between(kicking, average, None, kicking, legs, seen) == pytest.approx(deep[13])
+    # what the reference shows does not count, nor what was seen or lasts from one seen frame to the next
+    assert shown_between(kicking, average, average, kicking, legs, seen) == 0.0
+    assert shown_between(kicking, average, None, kicking, legs, np.arange(24)) == 0.0
+    lasting = kicking[np.where(np.abs(np.arange(24) - 14) <= 2, 13, 0)]
+    assert shown_between(lasting, average, None, lasting, legs, seen) == 0.0
+    # longer than what is scored at once
+    long = kicking[np.r_[np.zeros(2057, int), 13, np.zeros(30, int)]]
+    assert shown_between(long, average, None, long, legs, np.arange(0, 2088, 4)) == pytest.approx(deep[13])
+
+    assert mf.adapt(kicking, average, reference=average, blocks=("legs",)).status == "converged"
+    fit = mf.adapt(kicking, average, blocks=("legs",))
+    assert fit.details["frames"].tolist() == seen.tolist()
+    assert fit.status == "violations_left"
 
 
 def test_the_reference_is_looked_at_only_where_something_is_deep():

@@ -9,7 +9,7 @@ from scipy.ndimage import maximum_filter1d
 from motionfit._character import Character
 from motionfit._motion import Motion, host_kinematics, rest_motion
 from motionfit._onto import onto
-from motionfit.adapt._clearance import build_clearance, volume_depths
+from motionfit.adapt._clearance import MANY, build_clearance, volume_depths
 from motionfit.adapt._touches import Touches, touch_term, touches_of
 from motionfit.metrics import TOLERANCE, insides, poses_of, shown_before, shown_in, skin_depths
 from motionfit.shape.pairs import Pair
@@ -36,6 +36,28 @@ def reference_depths(
     if reference is None:
         return np.tile(volume_depths(clearance, rest_motion(body.skeleton)), (clip.frame_count, 1))
     return volume_depths(clearance, onto(clip, body.skeleton))
+
+
+def shown_between(
+    clip: Motion, character: Character, reference: Character | None, motion: Motion, pairs: tuple[Pair, ...],
+    seen: Int[np.ndarray, " seen"],
+) -> float:  # fmt: skip
+    """The greatest excess [m] on the skin in those frames between the `seen` ones in which a part is suddenly deep on
+    the volumes: a hand can swing through a thigh from one frame that was looked at to the next."""
+    if len(seen) == motion.frame_count:
+        return 0.0
+    clearance, sudden = build_clearance(character, pairs), []
+    for start in range(0, motion.frame_count, MANY):
+        frames = np.arange(start, min(start + MANY, motion.frame_count))
+        depth = volume_depths(clearance, motion[frames])
+        known = np.isin(frames, seen)
+        smooth = np.stack([np.interp(frames, frames[known], d) for d in depth[known].T], axis=1)
+        sudden.append(frames[(depth > smooth + TOLERANCE).any(axis=1)])
+    at = np.concatenate(sudden)
+    excess = skin_depths(character, motion[at], pairs).depth
+    if reference is not None:
+        excess = excess - skin_depths(reference, onto(clip[at], reference.skeleton), pairs).depth
+    return float(excess.max(initial=0.0))
 
 
 class Look(NamedTuple):

@@ -17,7 +17,10 @@ from motionfit.adapt._collisions import MEANT, collisions, hands_meet
 from motionfit.adapt._feet import footskate
 from motionfit.adapt._forearm import forearm
 from motionfit.adapt._limbs import LIMBS, limbs
+from motionfit.adapt._limits import shown_between
+from motionfit.metrics import TOLERANCE
 from motionfit.shape.growth import grow
+from motionfit.shape.pairs import pairs_of
 
 Progress = Callable[[str, int, int], None]
 
@@ -92,6 +95,10 @@ def adapt(
             options[name] = {"worth": worth, "progress": functools.partial(told, k, name)}
         fit = LATER[name](source, character, fit, reference=reference, **options.get(name, {}))
         told(k, name, 1, 1)
+    if first and objective == "vertex" and fit.status == "converged":
+        pairs, seen = pairs_of(*first), fit.details["frames"]
+        if shown_between(source, character, reference, fit.motion, pairs, seen) > TOLERANCE:
+            fit = dataclasses.replace(fit, status="violations_left")
     return dataclasses.replace(fit, motion=dataclasses.replace(fit.motion, source=Source(source, body)))
 
 
