@@ -24,7 +24,7 @@ from motionfit.adapt._touches import (
     touches_of,
     touching_on,
 )
-from motionfit.metrics import insides, nearest_on_skin, posed_vertices, poses_of, skin_depths, skin_gaps
+from motionfit.metrics import insides, nearest_on_skin, posed_vertices, poses_of, shown_before, skin_depths, skin_gaps
 from motionfit.shape import grow
 from motionfit.shape.pairs import Pair, pairs_of
 from motionfit.shape.surface import inside_depths, part_surface
@@ -259,7 +259,7 @@ def test_afterwards_only_what_comes_near_is_looked_at_again():
 
     looks._look, looks._own = look, lambda at: np.zeros((len(at), 1))
     near = np.isin(looks.frames, [5, 6])
-    assert looks.look_between(rest_motion(samples.walk().skeleton), near, everywhere=False)
+    assert looks.look_between(rest_motion(samples.walk().skeleton), near, every=None)
     assert set(seen) == {0, 8, 4, 5, 6, 7} and looks.at.tolist() == [0, 5, 6, 8]  # 4 and 7 beside them
 
 
@@ -310,6 +310,12 @@ def test_what_is_let_be_is_told(heavy, average, monkeypatch):
     assert mf.adapt(walk, heavy, reference=average, blocks=("legs",)).status == "converged"
     monkeypatch.setattr(SkinLooks, "most_seen", lambda *_: 0.011)
     assert mf.adapt(walk, heavy, reference=average, blocks=("legs",)).status == "violations_left"
+
+
+def test_a_result_is_looked_at_in_every_frame_that_the_solver_sees(heavy, average):
+    walk, legs = samples.walk(cycles=1), pairs_of("legs")
+    fit = mf.adapt(walk, heavy, reference=average, blocks=("legs",))
+    assert set(poses_of(fit.motion[fit.details["frames"]])) <= set(shown_before(heavy, legs))
 
 
 @pytest.fixture(scope="module")

@@ -155,7 +155,7 @@ def limbs(
                 # clean where it was looked at, or as clean as it gets: in between it is looked at once, and again where
                 # more may show since
                 near = case.left(after, on_skin, quiet).max(axis=1) > DOUBTFUL
-                missed = looks.look_between(moved, near, not checked)
+                missed = looks.look_between(moved, near, None if checked else 1)
                 on_skin, checked = looks.depths_and_touches(moved), checked or not missed
             # what the first looks missed
             woken = quiet & ~looks.quiet(on_skin)

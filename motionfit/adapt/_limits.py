@@ -19,7 +19,6 @@ LEAST_LOOKS, LOOK_SHARE = 16, 1 / 15  # looks at the skin: at least, and per fra
 MOST_JERK = 1.04  # ratio of a result's to that of the motion before it
 NEARLY = 0.9  # of TOLERANCE: what a result may show, since between two looks there may be a little more
 LOOKS_APART = 2  # [frames] that two looks are at least apart
-EVERY = 2  # of the solver's frames, the one in which a result is looked at once
 FLEETING = 0.025  # [m] of excess in a single frame, from which on a limb passes too fast to be led out and back
 ENOUGH = 0.7  # of TOLERANCE: what a look may still show
 FARTHER = 0.005  # [m] out than need be, from which on touches are eased
@@ -179,15 +178,15 @@ class SkinLooks:
         self._look_at(taken)
 
     def look_between(
-        self, motion: Motion, near: Bool[np.ndarray, " frames"] | None = None, everywhere: bool = True
+        self, motion: Motion, near: Bool[np.ndarray, " frames"] | None = None, every: int | None = 2
     ) -> bool:
-        """Look at a motion once in every second frame, unless not `everywhere`, and in all that may be `near` the
-        tolerance; from now on where some show nearly as much. Says whether there are any.
+        """Look at a motion once in `every` so many frames (None: where it is looked at anyway), and in all that may be
+        `near` the tolerance; from now on where some show nearly as much. Says whether there are any.
 
         What is deep in a single frame is let be, and told: a hand that swings through a hip is out again before it
         could be led around it, and what is tried for it spoils the frames beside it.
         """
-        at = np.union1d(self.at, self.frames[::EVERY] if everywhere else [])
+        at = np.union1d(self.at, [] if every is None else self.frames[::every])
         at = np.union1d(at, [] if near is None else self.frames[near]).astype(int)
         over = at[self._excess(motion, at) > NEARLY * TOLERANCE]
         beside = np.intersect1d([over - 1, over + 1], self.frames)
