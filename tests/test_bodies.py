@@ -6,14 +6,15 @@ import trimesh
 
 import motionfit as mf
 from motionfit.shape import bodies
+from motionfit.shape._body_measures import BUILTIN, SHAPES, joint_places
 
 VOLUME = {"average": (62, 84), "slim": (50, 72), "heavy": (100, 135), "child": (20, 31)}  # litres
 GIRTH = 0.09  # a smooth surface between few landmarks is not a tape measure
 
 
-@pytest.mark.parametrize("name", bodies.BUILTIN)
+@pytest.mark.parametrize("name", BUILTIN)
 def test_closed_human_sized_and_standing_flat(name):
-    body, shape = mf.load_character(f"builtin:{name}"), bodies.SHAPES[name]
+    body, shape = mf.load_character(f"builtin:{name}"), SHAPES[name]
     vertices = np.asarray(body.skin.vertices_bind)
     mesh = trimesh.Trimesh(vertices, body.skin.faces, process=False)
     assert mesh.is_watertight and mesh.euler_number == 2 and mesh.body_count == 1
@@ -31,10 +32,10 @@ def test_closed_human_sized_and_standing_flat(name):
     assert left == pytest.approx(right, rel=0.01)
 
 
-@pytest.mark.parametrize("name", bodies.BUILTIN)
+@pytest.mark.parametrize("name", BUILTIN)
 def test_girths(name):
-    body, shape = mf.load_character(f"builtin:{name}"), bodies.SHAPES[name]
-    at = {k: v for k, (_, v) in bodies._joints(shape).items()}
+    body, shape = mf.load_character(f"builtin:{name}"), SHAPES[name]
+    at = {k: v for k, (_, v) in joint_places(shape).items()}
     mesh = trimesh.Trimesh(body.skin.vertices_bind, body.skin.faces, process=False)
 
     def girth(origin, normal):
