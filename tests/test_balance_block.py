@@ -15,8 +15,9 @@ from motionfit.adapt._controls import lean_controls
 from motionfit.adapt._record import recorded
 from motionfit.adapt._sampling import sampling
 from motionfit.adapt._stages import SIGMA_EFFORT
-from motionfit.metrics import derivative_ratio
+from motionfit.metrics import TOLERANCE, derivative_ratio, skin_depths
 from motionfit.shape import grow
+from motionfit.shape.pairs import pairs_of
 from motionfit.splines import bspline_basis, per_frame
 from motionfit.terms import JointTracking, Standing
 from tests.helpers import central_difference, random_motion
@@ -43,6 +44,23 @@ def _bent(average, axis):
     control = Control("bend", (Drive(joint, np.array(axis) / np.linalg.norm(axis), 1.0),), basis)
     bent = Correction((control,), (np.full(basis.count, np.deg2rad(14.0)),))
     return walk, bent.apply(mf.onto(walk, average.skeleton))
+
+
+def test_thick_thighs_are_balanced_without_sinking_into_each_other(shared_data):
+    """A lean brings the thighs nearer, in some frames too near: the weight is shifted in others for it."""
+    clip = mf.load_motion(shared_data / "bvh/05_01_slow_walk.bvh")[:240]
+    own = mf.load_character(shared_data / "characters/avg_male.glb")
+    thick = grow(own, {"trunk": 1.087, "legs": 1.27})
+    fit = mf.adapt(clip, thick, reference=own, blocks=("legs", "balance"))
+    told, legs = fit.details["balance"], pairs_of("legs")
+    assert told["zmp_distance_before_m"] > 0.06 and fit.status == "converged"
+    assert told["zmp_distance_after_m"] <= told["zmp_distance_source_m"] + 0.001
+    assert len([h for h in fit.history if h.name == "balance"]) <= 5  # the effort is raised fast enough
+    excess = (
+        skin_depths(thick, fit.motion, legs, step=2).depth
+        - skin_depths(own, mf.onto(clip, own.skeleton), legs, step=2).depth
+    )
+    assert excess.max() <= TOLERANCE
 
 
 @pytest.fixture(scope="module")

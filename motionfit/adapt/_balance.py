@@ -44,10 +44,11 @@ LEAST_JERK = 10.0  # [m/s^3] for clips that stand still
 LEVER = 0.9  # [m] ankle to hip
 PASS_OVER = 0.08  # [s] within which the weight goes from one foot to the other
 STRETCH = 0.998  # of a leg's length, as far as it may be stretched: straight legs leave no way to shift the hips
-ROUNDS, PATIENCE = 5, 2  # rounds at most, and rounds without a better result
+ROUNDS, PATIENCE = 8, 3  # rounds at most, and rounds without a better result
+HOLD = 4.0  # times as heavy as in the round before is the effort of a frame that sank in
 AROUND = 0.1  # [s]
 NEAR, LOOKS_APART = 0.02, 1 / 15  # [m] by the fields, from which on thighs are looked at on the skin, and how often [s]
-FADE, FADES = 0.25, 8  # what goes of a lean at once where it sinks in or is jerky, and how often
+FADE, FADES = 0.15, 12  # what goes of a lean at once where it sinks in or is jerky, and how often
 OUTLIER = 0.05  # [m] beyond its threshold, from which on a frame counts by its distance, not by the square of that
 
 
@@ -141,7 +142,7 @@ def balance(
         if best.mean <= wanted + MEAN_ENOUGH or idle == PATIENCE:
             break
         smoother = smoother * (1.0 + _around(whole.jerky, at.dt))
-        held = held * (1.0 + _around(whole.sunk, at.dt))
+        held = held * (1.0 + (HOLD - 1.0) * _around(whole.sunk, at.dt))
         if whole.mean > wanted + MEAN_ENOUGH:
             left = np.where(whole.after.supported, np.asarray(whole.after.outside) - scale * threshold, 0.0)[at.frames]
             limit = limit - np.maximum(left, 0.0)
