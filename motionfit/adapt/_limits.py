@@ -45,14 +45,11 @@ def shown_between(
     the volumes: a hand can swing through a thigh from one frame that was looked at to the next."""
     if len(seen) == motion.frame_count:
         return 0.0
-    clearance, sudden = build_clearance(character, pairs), []
-    for start in range(0, motion.frame_count, MANY):
-        frames = np.arange(start, min(start + MANY, motion.frame_count))
-        depth = volume_depths(clearance, motion[frames])
-        known = np.isin(frames, seen)
-        smooth = np.stack([np.interp(frames, frames[known], d) for d in depth[known].T], axis=1)
-        sudden.append(frames[(depth > smooth + TOLERANCE).any(axis=1)])
-    at = np.concatenate(sudden)
+    clearance, frames = build_clearance(character, pairs), np.arange(motion.frame_count)
+    chunks = np.split(frames, np.arange(MANY, len(frames), MANY))
+    depth = np.concatenate([volume_depths(clearance, motion[some]) for some in chunks])
+    smooth = np.stack([np.interp(frames, seen, d) for d in depth[seen].T], axis=1)
+    at = np.flatnonzero((depth > smooth + TOLERANCE).any(axis=1))
     excess = skin_depths(character, motion[at], pairs).depth
     if reference is not None:
         excess = excess - skin_depths(reference, onto(clip[at], reference.skeleton), pairs).depth
