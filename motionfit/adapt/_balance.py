@@ -8,7 +8,7 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from motionfit._character import Character
 from motionfit._control import Control, Correction
@@ -21,16 +21,16 @@ from motionfit._solve import Block
 from motionfit._types import InputError
 from motionfit.adapt._clearance import build_clearance, volume_depths
 from motionfit.adapt._controls import lean_controls
-from motionfit.adapt._limits import MOST_JERK, NEARLY, reference_depths
+from motionfit.adapt._limits import MOST_JERK, NEARLY, reference_depths, unborne
 from motionfit.adapt._record import put_down
 from motionfit.adapt._sampling import Sampling, sampling
 from motionfit.adapt._standing import distances, weighed
 from motionfit.balance import WINDOW, Soles, ZmpDistance
-from motionfit.feet._leg import Leg, find_legs, turn_legs
+from motionfit.feet._leg import Leg, find_legs, lowering, turn_legs
 from motionfit.feet._remove import detect_footplants
 from motionfit.metrics import TOLERANCE, skin_depths
 from motionfit.shape.mass import Masses
-from motionfit.shape.pairs import PAIRS, pairs_of
+from motionfit.shape.pairs import PAIRS, Pair, pairs_of
 from motionfit.terms.balance import Standing, ZmpMargin
 from motionfit.terms.pose import Effort, Smoothness
 
@@ -268,24 +268,31 @@ def _jerk(motion: Motion) -> float:
 
 def _sinking(clip: Motion, character: Character, reference: Character | None, so_far: Motion, at: Sampling):
     """Says of a motion in which of the frames seen some pair shows nearly as much as the tolerance, and more than before
-    the block; of thighs and calves that come near each other on the skin too, which knows better where they touch."""
+    the block. Thighs and calves that come near each other are looked at on the skin too: it knows better where they
+    touch, and what the fields see and it does not bear out is no touch."""
     clearance, legs = build_clearance(character, PAIRS), pairs_of("legs")
+    columns = [PAIRS.index(p) for p in legs]
     limit = reference_depths(clip[at.frames], character, reference, PAIRS)
-    before = volume_depths(clearance, at.motion(so_far)) - limit
-    near = bool((before + limit)[:, [PAIRS.index(p) for p in legs]].max() > -NEAR)
-    looks = np.arange(0, len(at.frames), max(1, round(LOOKS_APART / at.dt)))
-    looked, own, columns = at.frames[looks], 0.0, [PAIRS.index(p) for p in legs]
-    # of all pairs, since the limbs' blocks looked at most of these poses already
-    if near and reference is not None:
+    near = bool(volume_depths(clearance, at.motion(so_far))[:, columns].max() > -NEAR)
+    looks = np.arange(0, len(at.frames) if near else 0, max(1, round(LOOKS_APART / at.dt)))
+    looked, own = at.frames[looks], 0.0
+    if reference is not None:
         own = skin_depths(reference, onto(clip[looked], reference.skeleton)).depth[:, columns]
-    before_on_skin = skin_depths(character, so_far[looked]).depth[:, columns] - own if near else None
+
+    def shown(motion: Motion, pairs: tuple[Pair, ...] = legs) -> tuple[np.ndarray, np.ndarray]:
+        """Excess [m] on the fields, per frame and pair, and on the skin, per look and pair of the legs."""
+        on_skin = skin_depths(character, motion[looked], pairs).depth[:, [pairs.index(p) for p in legs]] - own
+        on_fields = volume_depths(clearance, at.motion(motion)) - limit
+        on_fields[:, columns] -= unborne(on_fields[:, columns], on_skin, looks)
+        return on_fields, on_skin
+
+    # of all pairs, since the limbs' blocks looked at most of these poses already
+    before = shown(so_far, PAIRS)
 
     def sinks(motion: Motion) -> Bool[np.ndarray, " seen"]:
-        now = volume_depths(clearance, at.motion(motion)) - limit
-        result = np.asarray((now > _most(before)).any(axis=1))
-        if before_on_skin is not None:
-            on_skin = skin_depths(character, motion[looked], legs).depth - own
-            result[looks] |= (on_skin > _most(before_on_skin)).any(axis=1)
+        now = shown(motion)
+        result, result_looks = ((n > _most(b)).any(axis=1) for n, b in zip(now, before, strict=True))
+        result[looks] |= result_looks
         return result
 
     return sinks
@@ -321,11 +328,5 @@ def _stood(
 
 def _down(legs: list[Leg], before: list[Leg], dt: float) -> Float[np.ndarray, "frames 3"]:
     """How far [m] the body comes down so that no leg must be longer than it is, nor straighter than it was."""
-    needed = np.zeros(len(legs[0].hip))
-    for leg, old in zip(legs, before, strict=True):
-        reach = np.maximum(STRETCH * leg.length, np.linalg.norm(old.hip - old.ankle, axis=1))
-        needed = np.maximum(needed, np.linalg.norm(leg.hip - old.ankle, axis=1) - reach)
-    width = 2 * max(1, round(PASS_OVER / dt)) + 1
-    # the mean of a maximum over the same width never falls below the demand
-    down = uniform_filter1d(maximum_filter1d(np.maximum(needed, 0.0), width, mode="nearest"), width, mode="nearest")
-    return down[:, None] * np.array([0.0, 1.0, 0.0])
+    reach = [np.maximum(STRETCH * leg.length, np.linalg.norm(leg.hip - leg.ankle, axis=1)) for leg in before]
+    return lowering(legs, [leg.ankle for leg in before], dt, reach)[:, None] * np.array([0.0, 1.0, 0.0])

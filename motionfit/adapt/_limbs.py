@@ -17,7 +17,7 @@ from motionfit._problem import Problem
 from motionfit._types import InputError
 from motionfit.adapt._clearance import allowance, build_clearance, probe_depths, volume_depths
 from motionfit.adapt._controls import arm_controls, leg_controls
-from motionfit.adapt._limits import ENOUGH, MOST_JERK, NEARLY, SkinLooks, reference_depths
+from motionfit.adapt._limits import ENOUGH, MOST_JERK, NEARLY, SkinLooks, reference_depths, unborne
 from motionfit.adapt._sampling import sampling
 from motionfit.adapt._stages import (
     ALLOWED_EXCESS,
@@ -121,7 +121,7 @@ def limbs(
     clear, phantom = None, np.zeros_like(own)
     if looks is not None:
         at_start = looks.depths(small)
-        clear, phantom = looks.quiet(at_start), looks.phantom(before - own, at_start - looks.own)
+        clear, phantom = looks.quiet(at_start), unborne(before - own, at_start - looks.own, looks.at)
     quiet, kept, phantom = _quiet(before - own, own, case.pairs, clear, phantom)
     settled = checked = known and bool(quiet.all())  # and what is settled was looked at closely then
     correction = _beginning(case, start)

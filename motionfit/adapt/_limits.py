@@ -56,6 +56,21 @@ def shown_between(
     return float(excess.max(initial=0.0))
 
 
+def unborne(
+    excess: Float[np.ndarray, "frames pairs"], on_skin: Float[np.ndarray, "looks pairs"], at: Int[np.ndarray, " looks"]
+) -> Float[np.ndarray, "frames pairs"]:
+    """How much [m] of the fields' excess the skin does not bear out, which was looked at in the frames `at`; in between
+    looks by the shares of it in those on both sides that have any."""
+    result = np.zeros_like(excess)
+    for k in range(excess.shape[1]):
+        told = excess[at, k] > 0.0
+        if told.any():
+            share = 1.0 - np.maximum(on_skin[told, k], 0.0) / excess[at[told], k]
+            shares = np.interp(np.arange(len(excess)), at[told], np.maximum(share, 0.0))
+            result[:, k] = shares * np.maximum(excess[:, k], 0.0)
+    return result
+
+
 class Look(NamedTuple):
     """What one look at the skin showed."""
 
@@ -223,20 +238,6 @@ class SkinLooks:
     def quiet(self, seen: Float[np.ndarray, "looks pairs"]) -> Bool[np.ndarray, " pairs"]:
         """The pairs of which no look shows more than the tolerance."""
         return (seen <= self.own + TOLERANCE).all(axis=0)  # pyright: ignore[reportReturnType]
-
-    def phantom(
-        self, excess: Float[np.ndarray, "frames pairs"], on_skin: Float[np.ndarray, "looks pairs"]
-    ) -> Float[np.ndarray, "frames pairs"]:
-        """How much [m] of the fields' excess the skin does not bear out; in between looks by the shares of it in those
-        on both sides that have any."""
-        result = np.zeros_like(excess)
-        for k in range(excess.shape[1]):
-            told = excess[self.at, k] > 0.0
-            if told.any():
-                share = 1.0 - np.maximum(on_skin[told, k], 0.0) / excess[self.at[told], k]
-                shares = np.interp(self.frames, self.at[told], np.maximum(share, 0.0))
-                result[:, k] = shares * np.maximum(excess[:, k], 0.0)
-        return result
 
     def joined(
         self, excess: Float[np.ndarray, "frames pairs"], on_skin: Float[np.ndarray, "looks pairs"],

@@ -199,12 +199,17 @@ def _calmest_way(frames: int, plants: tuple[tuple[int, int], ...], dt: float, an
     return share, cost, splu((share.T @ cost @ share).tocsc()).solve if own.any() else None
 
 
-def lowering(legs: list[Leg], targets: list[Float[np.ndarray, "frames 3"]], dt: float) -> Float[np.ndarray, " frames"]:
+def lowering(
+    legs: list[Leg], targets: list[Float[np.ndarray, "frames 3"]], dt: float,
+    reaches: list[Float[np.ndarray, " frames"]] | None = None,
+) -> Float[np.ndarray, " frames"]:  # fmt: skip
     """How far [m] the character must come down so that both legs reach, as a smooth curve over what each frame asks
-    for: the largest demand within the ease, averaged twice (thesis 5.5.1 lowers by one small amount)."""
+    for: the largest demand within the ease, averaged twice (thesis 5.5.1 lowers by one small amount). `reaches` [m] are
+    those of each leg, nearly their lengths by default."""
+    reaches = [STRETCH * leg.length for leg in legs] if reaches is None else reaches
     needed = np.zeros(len(legs[0].hip))
-    for leg, target in zip(legs, targets, strict=True):
-        gap, reach = leg.hip - target, STRETCH * leg.length
+    for leg, target, reach in zip(legs, targets, reaches, strict=True):
+        gap = leg.hip - target
         up = np.sqrt(np.maximum(reach**2 - gap[:, 0] ** 2 - gap[:, 2] ** 2, 0.0))
         needed = np.maximum(needed, np.minimum(gap[:, 1] - up, LOWEST * leg.length))
     if not needed.any():
