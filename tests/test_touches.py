@@ -341,6 +341,11 @@ def test_what_is_deep_in_a_frame_that_no_block_saw_is_told(average, heavy, kicki
     assert shown_between(kicking, average, None, kicking, legs, np.arange(24)) == 0.0
     lasting = kicking[np.where(np.abs(np.arange(24) - 14) <= 2, 13, 0)]
     assert shown_between(lasting, average, None, lasting, legs, seen) == 0.0
+    # after the last that was seen nothing says what goes on
+    ending = kicking[np.where(np.arange(24) > 21, 13, 0)]
+    assert shown_between(ending, average, None, ending, legs, seen) == pytest.approx(deep[13])
+    lasting = kicking[np.where(np.arange(24) >= 20, 13, 0)]
+    assert shown_between(lasting, average, None, lasting, legs, seen) == pytest.approx(deep[13])
     # longer than what is scored at once, and the frame that is over was not seen
     long = kicking[np.r_[np.zeros(2048, int), 13]]
     assert shown_between(long, average, None, long, legs, np.arange(0, 2049, 3)) == pytest.approx(deep[13])

@@ -42,14 +42,16 @@ def shown_between(
     seen: Int[np.ndarray, " seen"],
 ) -> float:  # fmt: skip
     """The greatest excess [m] on the skin in those frames between the `seen` ones in which a part is suddenly deep on
-    the volumes: a hand can swing through a thigh from one frame that was looked at to the next."""
+    the volumes, and in the last of all: a hand can swing through a thigh from one frame that was looked at to the next."""
     if len(seen) == motion.frame_count:
         return 0.0
     clearance, frames = build_clearance(character, pairs), np.arange(motion.frame_count)
     chunks = np.split(frames, np.arange(MANY, len(frames), MANY))
     depth = np.concatenate([volume_depths(clearance, motion[some]) for some in chunks])
     smooth = np.stack([np.interp(frames, seen, d) for d in depth[seen].T], axis=1)
-    at = np.flatnonzero((depth > smooth + TOLERANCE).any(axis=1))
+    sudden = (depth > smooth + TOLERANCE).any(axis=1)
+    sudden[-1] = True  # it may lie beyond what was seen
+    at = np.flatnonzero(sudden)
     excess = skin_depths(character, motion[at], pairs).depth
     if reference is not None:
         excess = excess - skin_depths(reference, onto(clip[at], reference.skeleton), pairs).depth
