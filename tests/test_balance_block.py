@@ -18,7 +18,7 @@ from motionfit.adapt._sampling import sampling
 from motionfit.adapt._stages import SIGMA_EFFORT
 from motionfit.metrics import TOLERANCE, derivative_ratio, skin_depths
 from motionfit.shape import grow
-from motionfit.shape.pairs import pairs_of
+from motionfit.shape.pairs import PAIRS, pairs_of
 from motionfit.splines import bspline_basis, per_frame
 from motionfit.terms import JointTracking, Standing
 from tests.helpers import central_difference, random_motion
@@ -293,6 +293,18 @@ def test_a_lean_gives_way_where_thighs_show_on_the_skin(average, monkeypatch):
     )
     blind = _sinking(walk, heavy, average, so_far.motion, at)  # the fields tell of nothing
     assert blind(together).any() and not blind(so_far.motion).any()
+
+    def of_thighs(clearance, motion):
+        """Fields that see thighs in each other in all but the motion before."""
+        same = np.array_equal(motion.rotations, so_far.motion.rotations[at.frames])
+        return np.where([p in pairs_of("legs") for p in PAIRS], -0.01 if same else 0.03, -0.01) * np.ones(
+            (len(at.frames), 1)
+        )
+
+    monkeypatch.setattr("motionfit.adapt._balance.volume_depths", of_thighs)
+    wary = _sinking(walk, heavy, average, so_far.motion, at)
+    apart = mf.onto(walk, heavy.skeleton)[np.zeros(walk.frame_count, int)]
+    assert wary(together).any() and not wary(apart).any()  # the skin bears out the one, not the other
 
 
 @pytest.mark.slow
