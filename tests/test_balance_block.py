@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 import motionfit as mf
 from motionfit import samples
 from motionfit._control import Control, Correction, Drive
-from motionfit._motion import Motion, continued, host_kinematics, joint_angles, padded
-from motionfit.adapt._balance import _cleaned, _jerky, _Leaned, _sinking
+from motionfit._motion import Motion, continued, host_kinematics, joint_angles, padded, rest_motion
+from motionfit.adapt._balance import _cleaned, _jerky, _Leaned, _sinking, _stood
 from motionfit.adapt._controls import lean_controls
 from motionfit.adapt._limits import MOST_JERK
 from motionfit.adapt._record import recorded
@@ -187,6 +187,17 @@ def test_standing_moves_the_body_and_not_the_feet():
     gap = np.asarray(kin.positions_world[:, 1] - kin.positions_world[:, 4])
     np.testing.assert_allclose(rows[:, 0] - rows[:, 1], gap, atol=1e-12)
     assert one_foot.reach == 0
+
+
+def test_legs_that_are_straight_may_stay_so(average):
+    """A body comes down for legs that would be straighter than they were, not for those that are."""
+    still = rest_motion(average.skeleton)[np.zeros(30, int)]
+    at = sampling(still)
+    controls = lean_controls(average, still, at.whole, True, False)
+    points = Correction.zero(tuple(at.control(c) for c in controls))
+    feet = tuple(average.skeleton.joint(f"{s}_foot") for s in ("left", "right"))
+    stood = _stood(_alone(still, average), controls, at, points, feet, np.full((30, 2), 0.5))
+    np.testing.assert_allclose(stood.motion.root, still.root, atol=1e-6)
 
 
 def test_its_gradient_is_that_of_finite_differences():
