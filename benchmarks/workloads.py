@@ -299,13 +299,16 @@ def ten_minutes(rate: float = 120.0) -> Iterator[Metric]:
     yield Metric("ten-minutes.excess_left", _left(fit), "m", "lower", 0.05, 2e-4)
 
 
-def frames(count: int, base: int = 600) -> Iterator[Metric]:
+DRAFT = {"objective": "capsule", "blocks": ("arms", "legs")}  # nothing is looked at on the skin
+
+
+def frames(count: int, base: int = 600, draft: bool = False) -> Iterator[Metric]:
     """Whole adaptation of a long clip, warm: time per frame over that of a 600-frame clip, and memory."""
-    key = f"frames-{count}"
+    key, options = f"frames-{count}{'-capsule' if draft else ''}", DRAFT if draft else {}
     if count >= 3000:
         _skip_dense(count)
     heavy, average = body("heavy"), body("average")
-    long, short = (functools.partial(mf.adapt, clip_of(n), heavy, reference=average) for n in (count, base))
+    long, short = (functools.partial(mf.adapt, clip_of(n), heavy, reference=average, **options) for n in (count, base))
     reset_peak_memory()
     start = time.perf_counter()
     fit = long()
@@ -347,9 +350,9 @@ def girths(count: int) -> list[dict[str, float]]:
     return [grid[k] for k in np.linspace(0, len(grid) - 1, count + 2).astype(int)[1:-1]] if count < len(grid) else grid
 
 
-def shapes(count: int, frame_count: int = FRAMES) -> Iterator[Metric]:
+def shapes(count: int, frame_count: int = FRAMES, draft: bool = False) -> Iterator[Metric]:
     """One clip on many girths in one batch: time per shape over that of `adapt` alone, what is left, memory."""
-    key = f"shapes-{count}"
+    key, options = f"shapes-{count}{'-capsule' if draft else ''}", DRAFT if draft else {"blocks": ("arms", "legs")}
     if not hasattr(mf, "adapt_many"):
         raise Skip("this version has no motionfit.adapt_many")
     if count >= 100:
@@ -360,11 +363,11 @@ def shapes(count: int, frame_count: int = FRAMES) -> Iterator[Metric]:
     peaks = [0.0]
 
     def many() -> list[float]:
-        fits = mf.adapt_many(walk, bodies, reference=average, blocks=("arms", "legs"),
+        fits = mf.adapt_many(walk, bodies, reference=average, **options,
                              progress=lambda _: peaks.append(peak_memory_gib(children=True)))  # fmt: skip
         return [_left(fit) for fit in fits]
 
-    alone = functools.partial(mf.adapt, walk, bodies[len(bodies) // 2], reference=average, blocks=("arms", "legs"))
+    alone = functools.partial(mf.adapt, walk, bodies[len(bodies) // 2], reference=average, **options)
     reset_peak_memory()
     start = time.perf_counter()
     left = many()
@@ -451,11 +454,13 @@ def entries() -> tuple[Entry, ...]:
         made("frames-300", frames, 300),
         made("frames-3000", frames, 3000, heavy=True),
         made("frames-30000", frames, 30000, heavy=True),
+        *(made(f"frames-{n}-capsule", frames, n, 600, True, heavy=True) for n in (300, 3000, 30000)),
         made("ten-minutes", ten_minutes, heavy=True),
         made("joints-adapt", joints_adapt, heavy=True),
         made("shapes-1", shapes, 1),
         made("shapes-8", shapes, 8),
         made("shapes-243", shapes, 243, 800, heavy=True),
+        made("shapes-243-capsule", shapes, 243, 800, True, heavy=True),
         made("cold", cold),
         made("solvers", finite_differences.solvers),
         made("finite-differences", finite_differences.entry, heavy=True),
