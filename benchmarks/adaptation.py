@@ -96,11 +96,12 @@ def constant_offset(fit: mf.Fit, character: mf.Character, own: np.ndarray, at: n
 
 
 def row(
-    clip: Motion, character: mf.Character, reference: mf.Character, blocks: Sequence[str], frames: int, offset: bool
-) -> dict:
+    clip: Motion, character: mf.Character, reference: mf.Character, blocks: Sequence[str], objective: str, frames: int,
+    offset: bool,
+) -> dict:  # fmt: skip
     """One clip on one body: shares of frames over 1 cm, inside ratios, deviations and smoothness."""
     started = time.perf_counter()
-    fit = mf.adapt(clip, character, reference=reference, blocks=blocks)
+    fit = mf.adapt(clip, character, reference=reference, blocks=blocks, objective=objective)
     seconds = time.perf_counter() - started
     step = max(1, fit.base.frame_count // frames)
     own = skin_depths(reference, mf.onto(clip, reference.skeleton), step=step)
@@ -138,6 +139,7 @@ def main() -> None:
     parser.add_argument(
         "--blocks", default=",".join(mf.adapt.DEFAULT), help="an offset does the work of arms,legs only"
     )
+    parser.add_argument("--objective", default="vertex", help="as in `mf.adapt`")
     parser.add_argument("--offset", action="store_true", help="compare with the best constant offset")
     options = parser.parse_args()
     keys: list[str] = []
@@ -155,7 +157,8 @@ def main() -> None:
             if scale:
                 reference = character
                 character = grow(character, dict.fromkeys(("arms", "legs", "trunk"), float(scale)))
-            found = row(clip, character, reference, options.blocks.split(","), options.frames, options.offset)
+            found = row(clip, character, reference, options.blocks.split(","), options.objective, options.frames,
+                        options.offset)  # fmt: skip
             if not keys:
                 keys = list(found)
                 print("| clip | body | " + " | ".join(keys) + " |")
