@@ -11,7 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -299,7 +299,7 @@ def ten_minutes(rate: float = 120.0) -> Iterator[Metric]:
     yield Metric("ten-minutes.excess_left", _left(fit), "m", "lower", 0.05, 2e-4)
 
 
-DRAFT = {"objective": "capsule", "blocks": ("arms", "legs")}  # nothing is looked at on the skin
+DRAFT: dict[str, Any] = {"objective": "capsule", "blocks": ("arms", "legs")}  # nothing is looked at on the skin
 
 
 def frames(count: int, base: int = 600, draft: bool = False) -> Iterator[Metric]:
@@ -352,7 +352,7 @@ def girths(count: int) -> list[dict[str, float]]:
 
 def shapes(count: int, frame_count: int = FRAMES, draft: bool = False) -> Iterator[Metric]:
     """One clip on many girths in one batch: time per shape over that of `adapt` alone, what is left, memory."""
-    key, options = f"shapes-{count}{'-capsule' if draft else ''}", DRAFT if draft else {"blocks": ("arms", "legs")}
+    key, options = f"shapes-{count}{'-capsule' if draft else ''}", DRAFT if draft else {"blocks": DRAFT["blocks"]}
     if not hasattr(mf, "adapt_many"):
         raise Skip("this version has no motionfit.adapt_many")
     if count >= 100:

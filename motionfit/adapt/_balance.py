@@ -290,10 +290,11 @@ def _sinking(clip: Motion, character: Character, reference: Character | None, so
     before = shown(so_far, PAIRS)
 
     def sinks(motion: Motion) -> Bool[np.ndarray, " seen"]:
-        now = shown(motion)
-        result, result_looks = ((n > _most(b)).any(axis=1) for n, b in zip(now, before, strict=True))
-        result[looks] |= result_looks
-        return result
+        on_fields, on_skin = (
+            np.asarray((now > _most(was)).any(axis=1)) for now, was in zip(shown(motion), before, strict=True)
+        )
+        on_fields[looks] |= on_skin
+        return on_fields
 
     return sinks
 

@@ -49,7 +49,7 @@ def shown_between(
     chunks = np.split(frames, np.arange(MANY, len(frames), MANY))
     depth = np.concatenate([volume_depths(clearance, motion[some]) for some in chunks])
     smooth = np.stack([np.interp(frames, seen, d) for d in depth[seen].T], axis=1)
-    sudden = (depth > smooth + TOLERANCE).any(axis=1)
+    sudden = np.asarray((depth > smooth + TOLERANCE).any(axis=1))
     sudden[-1] = True  # it may lie beyond what was seen
     at = np.flatnonzero(sudden)
     excess = skin_depths(character, motion[at], pairs).depth
